@@ -117,6 +117,14 @@ def test_best_and_second_of_the_group_and_the_papers_values(tmp_path: Path) -> N
     assert rows["Constant velocity"].cells["minSADE"] == Cell(0.5, None, None, None)
 
 
+def test_the_paper_has_no_values_of_games_without_pair_terms_or_with_other_parts(tmp_path: Path) -> None:
+    changes = {"paper": {}, "no pair": {"energy.pair": []}, "another": {"solver.name": "gradient_descent"}}
+    for title, given_settings in changes.items():
+        make_run(tmp_path / title, title, "epo", scores(0.1), settings=given_settings)
+    known = {name: row.cells["minSADE"].paper is not None for name, row in rows_of(tmp_path).items()}
+    assert known == {"paper": True, "no pair": False, "another": False}
+
+
 def test_equal_printed_values_have_equal_ranks(tmp_path: Path) -> None:
     for name, value in (("a", 0.10001), ("b", 0.10002), ("c", 0.2), ("d", math.nan)):
         make_run(tmp_path / name, name, "epo", scores(value))
