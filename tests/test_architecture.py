@@ -25,7 +25,7 @@ FLOORS = {
     "masking": set(),
     "host": set(),
     "warp_kernels": set(),
-    "pretrained": {"scene"},
+    "pretrained": {"scene", "registry"},
     "run_folder": {"registry", "masking", "pretrained"},
     "optimizers": {"registry", "checks"},
     "losses": set(),
