@@ -143,7 +143,9 @@ def test_whole_training_steps_are_compared_without_and_with_a_graph(tmp_path, mo
     assert "a step of +EPO takes" in lines[3]
     lines = list(training_step.whole_steps([*words, "solver.adaptive=true"], torch.device("cpu"), 1))
     assert len(lines) == 3
-    assert "from a CUDA graph: trainer.graph=true with solver.backend=auto" in lines[2]
+    assert (
+        "from a CUDA graph: trainer.graph=true with solver.name=levenberg_marquardt and solver.backend=auto" in lines[2]
+    )
 
 
 def test_other_rows_are_timed_and_need_data(tmp_path):
