@@ -299,3 +299,20 @@ def _check_tensor(name: str, value: Any, numbers: str, shape: tuple[str | int, .
             raise ValueError(f"scene.{name} has shape {list(value.shape)}; it takes at least {least} {unit}")
         if isinstance(dim, str):
             sizes[dim] = got
+
+
+def observed_future(
+    scene: Scene, needs: str = "training needs"
+) -> tuple[Float[Tensor, "B N K 4"], Bool[Tensor, "B N K"]]:
+    """The future of a scene, and the mask of the steps at which present agents were observed.
+
+    Args:
+        scene: a batch.
+        needs: subject and verb of the error message.
+
+    Raises:
+        ValueError: the scene has no future.
+    """
+    if scene.future is None or scene.future_mask is None:
+        raise ValueError(f"{needs} scene.future [B, N, K, 4], which is None")
+    return scene.future, scene.future_mask & scene.agent_mask[..., None]

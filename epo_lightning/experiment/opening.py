@@ -85,7 +85,7 @@ def refuse_changed(run: RunFolder, data: Any) -> None:
 
 
 def _restore(data: Any) -> str:
-    """What has to be restored for data to be that of a run."""
+    """Advice on what to restore, so that the data is again that of a run."""
     if isinstance(data, RecordedData) and data.reader:
         return f"restore the recordings, or the file in which format {data.format!r} is registered"
     return "restore the data of that digest"

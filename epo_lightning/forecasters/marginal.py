@@ -12,10 +12,9 @@ from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.game.tracking import with_motion
 from epo_lightning.metrics.functional import marginal_to_joint
 from epo_lightning.objectives.base import Terms, checked_weights
-from epo_lightning.objectives.terms import observed_future
 from epo_lightning.optimizers import Adam
 from epo_lightning.registry import register
-from epo_lightning.scene import Scene
+from epo_lightning.scene import Scene, observed_future
 from epo_lightning.task import Task
 
 

@@ -16,7 +16,7 @@ from epo_lightning.metrics.functional import expected_calibration_error, reliabi
 from epo_lightning.metrics.functional.calibration import BINS
 from epo_lightning.metrics.functional.displacement import Errors
 from epo_lightning.metrics.functional.overlap import overlap_rates
-from epo_lightning.scene import SHAPES, Scene
+from epo_lightning.scene import SHAPES, Scene, observed_future
 
 METRICS = ("minADE", "minFDE", "minSADE", "minSFDE", "overlap_jfp", "overlap_authors")
 """Scores of every forecaster; displacements in m, overlaps as rates."""
@@ -124,7 +124,7 @@ class ForecastMetrics(Metric):
         Raises:
             ValueError: the scene has no future or no sizes, or another number of agents or steps than the forecast.
         """
-        average = Errors.average(forecast.states, *observed_future(scene))
+        average = Errors.average(forecast.states, *observed_future(scene, "displacements need"))
         found = forecast_values(forecast, scene, average, self.shape)
         none = torch.full_like(found["minADE"], torch.nan)
         values = torch.stack([found.get(name, none).double() for name in COLUMNS], dim=1)
@@ -158,17 +158,6 @@ class ForecastMetrics(Metric):
         return scores
 
 
-def observed_future(scene: Scene) -> tuple[Float[Tensor, "B N K 4"], Bool[Tensor, "B N K"]]:
-    """The future of a scene, and the mask of the steps at which present agents were observed.
-
-    Raises:
-        ValueError: the scene has no future.
-    """
-    if scene.future is None or scene.future_mask is None:
-        raise ValueError("displacements need scene.future [B, N, K, 4], which is None")
-    return scene.future, scene.future_mask & scene.agent_mask[..., None]
-
-
 def forecast_values(
     forecast: JointForecast, scene: Scene, average: Errors, shape: str
 ) -> dict[str, Float[Tensor, " B"]]:
@@ -185,7 +174,7 @@ def forecast_values(
     if scene.size is None:
         raise ValueError("overlap rates need scene.size [B, N, 2], which is None")
     states, probabilities = forecast.states, forecast.probabilities
-    future, mask = observed_future(scene)
+    future, mask = observed_future(scene, "displacements need")
     final = Errors.final(states, future, mask)
     values = {
         "minADE": average.marginal(),

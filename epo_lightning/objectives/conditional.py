@@ -11,9 +11,9 @@ from epo_lightning import losses
 from epo_lightning.forecast import JointForecast
 from epo_lightning.game.energy import Energy
 from epo_lightning.objectives.base import Objective, Terms, checked_weights
-from epo_lightning.objectives.terms import goal_term, observed_future
+from epo_lightning.objectives.terms import goal_term
 from epo_lightning.registry import ConfigError, nearest, register
-from epo_lightning.scene import Scene
+from epo_lightning.scene import Scene, observed_future
 from epo_lightning.solvers.base import TABLES
 from epo_lightning.solvers.discrete import assignments
 

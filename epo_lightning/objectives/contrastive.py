@@ -22,9 +22,9 @@ from epo_lightning.game.energy import GRADIENT, Energy
 from epo_lightning.game.selection import games
 from epo_lightning.game.tracking import demonstrated, observed_controls
 from epo_lightning.objectives.base import Objective, Terms, checked_weights
-from epo_lightning.objectives.terms import goal_term, observed_future
+from epo_lightning.objectives.terms import goal_term
 from epo_lightning.registry import register
-from epo_lightning.scene import Scene
+from epo_lightning.scene import Scene, observed_future
 from epo_lightning.solvers.base import PATH, SAMPLES, STATIONARY
 
 

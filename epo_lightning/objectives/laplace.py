@@ -32,9 +32,9 @@ from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.selection import evaluated
 from epo_lightning.game.tracking import demonstrated, observed_controls
 from epo_lightning.objectives.base import Objective, Terms, checked_weights
-from epo_lightning.objectives.terms import goal_term, observed_future
+from epo_lightning.objectives.terms import goal_term
 from epo_lightning.registry import register
-from epo_lightning.scene import Scene
+from epo_lightning.scene import Scene, observed_future
 from epo_lightning.solvers.base import PATH, SAMPLES, STATIONARY
 from epo_lightning.solvers.gauss_newton.normal_equations import by_channel, normal_equations
 from epo_lightning.solvers.general import dense

@@ -4,25 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from jaxtyping import Bool, Float
-from torch import Tensor
-
 from epo_lightning import losses
 from epo_lightning.decoders.goals import goal_candidates
 from epo_lightning.forecast import JointForecast
 from epo_lightning.objectives.base import Terms
-from epo_lightning.scene import Scene
-
-
-def observed_future(scene: Scene) -> tuple[Float[Tensor, "B N K 4"], Bool[Tensor, "B N K"]]:
-    """The observed futures, and the mask of their real steps.
-
-    Raises:
-        ValueError: the scene has no future.
-    """
-    if scene.future is None or scene.future_mask is None:
-        raise ValueError("training needs scene.future [B, N, K, 4], which is None")
-    return scene.future, scene.future_mask & scene.agent_mask[..., None]
+from epo_lightning.scene import Scene, observed_future
 
 
 def goal_term(scene: Scene, forecast: JointForecast, weight: float) -> Terms:

@@ -129,18 +129,20 @@ def of_different_code(rows: Sequence[Row]) -> list[str]:
     """Notes on the data sets whose runs were trained by different code; where it was not recorded, at different commits."""
     notes = []
     for data in dict.fromkeys(row.runs[0].data for row in rows):
-        codes: dict[str, dict[str, list[str]]] = {}
+        codes: dict[tuple[str, str], dict[str, list[str]]] = {}
         for row in rows:
             for run in row.runs:
                 if run.data == data and run.learned:
-                    code = run.code or f" at commit {run.git_commit[:7]}, whose code was not recorded"
+                    code = (
+                        run.code,
+                        "" if run.code else f" at commit {run.git_commit[:7]}, whose code was not recorded",
+                    )
                     codes.setdefault(code, {}).setdefault(row.name, []).append(str(run.seed))
         if len(codes) < 2:
             continue
         groups = (
-            ", ".join(f"{name} (seed {', '.join(dict.fromkeys(seeds))})" for name, seeds in trained.items())
-            + (code if code.startswith(" ") else "")
-            for code, trained in codes.items()
+            ", ".join(f"{name} (seed {', '.join(dict.fromkeys(seeds))})" for name, seeds in trained.items()) + where
+            for (_, where), trained in codes.items()
         )
         notes.append(
             f"Runs on {data} were trained by different code, which may explain differences between them: "
