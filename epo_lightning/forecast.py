@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from epo_lightning.batch import Batch
@@ -268,3 +268,18 @@ def log_probabilities(probabilities: Tensor, logits: Tensor | None, dim: int) ->
     # For probabilities that are not tiny, both formulas are correct but differ in the last digit. The first one is used
     # there, so that the results of earlier versions are reproduced exactly.
     return torch.where(probabilities > math.sqrt(least), logs, logits.log_softmax(dim))
+
+
+DISTINCT = 0.1
+"""Distance [m] from which on two joint motions are different: that of some agent's positions at some step."""
+
+
+def same_motion(states: Float[Tensor, "B M N K _"]) -> Bool[Tensor, "B M M"]:
+    """Whether two joint motions of a scene are the same, to less than :data:`DISTINCT`.
+
+    Args:
+        states: motions, x and y [m] first; a motion that is not finite is the same as no other one.
+    """
+    positions = states[..., :2]
+    apart = (positions[:, :, None] - positions[:, None]).norm(dim=-1)
+    return (apart < DISTINCT).flatten(3).all(-1)

@@ -17,7 +17,7 @@ from torch import Tensor
 from epo_lightning.backbones.base import Backbone
 from epo_lightning.checks import check_choice, check_number
 from epo_lightning.decoders.goals import Goals
-from epo_lightning.decoders.orders import DecodedOrders, Orders, repeated
+from epo_lightning.decoders.orders import DecodedOrders, Orders
 from epo_lightning.decoders.probabilities import PROBABILITIES, check_probabilities
 from epo_lightning.decoders.weights import Margins
 from epo_lightning.forecast import GameParameters, JointForecast, Solution, Status
@@ -41,6 +41,7 @@ from epo_lightning.forecasters.epo_settings import (
     check_needs,
     check_start,
 )
+from epo_lightning.forecasters.repeats import repeats_joined, without_repeated_choices
 from epo_lightning.game.energy import FEATURES, RESIDUALS, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.objectives.base import Objective, Terms
@@ -90,7 +91,8 @@ class EPO(Forecaster):
             the forecast cannot explain agents that act for a later goal. If it is above K,
             ``Scene.game_steps`` may end a scene's game earlier. Initial strategies have ``game_horizon`` steps.
         one_game: whether the modes are equilibria of one game, found from the initial strategies; its pair weights are
-            positive. With an energy of orders (which agent of a pair is ahead), modes differ in orders and goals (TGL).
+            positive. Modes that end at the same equilibrium are one outcome (:mod:`~epo_lightning.forecasters.repeats`).
+            With an energy of orders (which agent of a pair is ahead), modes differ in orders and goals (TGL).
             Otherwise every mode has a game of its own, as in the paper.
         own_weights: ``decoded`` for each agent by the network, or ``shared`` by all agents, modes and scenes.
         pair_weights: the same for pairs; shared ones are positive.
@@ -198,11 +200,15 @@ class EPO(Forecaster):
             parameters = parameters.for_every_mode(self.modes)
         solution = self.differentiable_solve(self._minimiser, self.energy, solved_scene, parameters)
         settled = self._without_noise(solution, solved_scene, parameters)
+        states, controls = settled.states[..., : self.task.horizon, :], settled.controls[..., : self.task.horizon, :]
         logits = self._mode_logits(z, scene, goals, orders, settled)
+        if self.one_game and self.probabilities is not None:
+            # The solver may find one equilibrium of the game from several starts.
+            states, controls, logits = repeats_joined(states, controls, logits, scene.agent_mask)
         return JointForecast(
-            states=settled.states[..., : self.task.horizon, :],
+            states=states,
             probabilities=logits.softmax(1),
-            controls=settled.controls[..., : self.task.horizon, :],
+            controls=controls,
             initial_states=self._states_of_initial_strategies(scene, parameters),
             parameters=parameters,
             solution=solution,
@@ -313,10 +319,10 @@ class EPO(Forecaster):
         """
         if solution.assignment is not None:
             stopped = (solution.status == Status.STOPPED).any(1, keepdim=True)
-            return _without_repeats(-torch.where(stopped, 0.0, solution.energy), solution.assignment)
+            return without_repeated_choices(-torch.where(stopped, 0.0, solution.energy), solution.assignment)
         if orders is not None:
             choices = orders.order if goals.chosen is None else torch.cat((orders.order.long(), goals.chosen), -1)
-            return _without_repeats(orders.log_probability + goals.log_probability, choices)
+            return without_repeated_choices(orders.log_probability + goals.log_probability, choices)
         assert self.probabilities is not None
         current = scene.current_or_zero
         positions = solution.states[..., : self.task.horizon, :2]
@@ -395,8 +401,3 @@ class EPO(Forecaster):
 
     def losses(self, scene: Scene, forecast: JointForecast) -> Terms:
         return self.objective(self._with_game_end(scene), forecast, self.energy, self.global_step)
-
-
-def _without_repeats(score: Tensor, modes: Tensor) -> Tensor:
-    """Logits [B, M] of modes, -inf for a mode that repeats an earlier one."""
-    return torch.where(repeated(modes), -torch.inf, score)

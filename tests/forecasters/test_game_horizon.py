@@ -68,19 +68,11 @@ class TestGame(ForecasterSuite):
         scene = super().scene(scenes, **details)
         return dataclasses.replace(scene, goal_headings=torch.zeros(*scene.agent_mask.shape, 1))
 
-    def test_padding_does_not_change_training(self) -> None:
-        """After few steps: modes of one game that meet in its minimum are equally close, so rounding would choose one."""
-        few = {**SOLVER, "steps": 2, "newton_steps": 0}
-        forecaster, scene = self.forecaster(solver=few).double().train(), self.scene(6).to(torch.double)
-        alone = forecaster.losses(scene, forecaster(scene))
-        padded = self.padded(scene)
-        for name, (_, value) in forecaster.losses(padded, forecaster(padded)).items():
-            torch.testing.assert_close(value, alone[name][1], rtol=1e-5, atol=1e-5)
-
 
 def built(**changes: Any) -> Any:
     torch.manual_seed(0)
-    return build_forecaster(model({**GAME, **changes}, **PARTS)).eval()
+    parts = {**PARTS, **{part: changes.pop(part) for part in PARTS.keys() & changes.keys()}}
+    return build_forecaster(model({**GAME, **changes}, **parts)).eval()
 
 
 def test_the_forecast_is_the_beginning_of_the_solution_of_the_longer_game() -> None:
@@ -91,7 +83,9 @@ def test_the_forecast_is_the_beginning_of_the_solution_of_the_longer_game() -> N
     assert forecast.states.shape == (3, 2, 2, 40, 4)
     assert forecast.controls is not None
     assert forecast.controls.shape == (3, 2, 2, 40, 2)
-    assert torch.equal(forecast.states, forecast.solution.states[..., :40, :])
+    kept = forecast.probabilities > 0  # modes that repeat an earlier one have its states
+    assert kept[:, 0].all()
+    assert torch.equal(forecast.states[kept], forecast.solution.states[kept][..., :40, :])
     assert forecast.parameters is not None
     assert forecast.parameters.initial_controls.shape == (3, 2, 2, 46, 2)
     with torch.no_grad():

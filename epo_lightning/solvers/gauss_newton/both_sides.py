@@ -19,18 +19,14 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
 
 from epo_lightning.checks import check_number
-from epo_lightning.forecast import GameParameters, Solution
+from epo_lightning.forecast import GameParameters, Solution, same_motion
 from epo_lightning.game.energy import Energy
 from epo_lightning.registry import ConfigError, register
 from epo_lightning.scene import Scene
 from epo_lightning.solvers.base import STATIONARY, Minimiser
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
-
-DISTINCT = 0.1
-"""Distance [m] from which on two solutions are different: that of some agent's positions at some step."""
 
 
 @register("solver", "both_sides")
@@ -135,7 +131,7 @@ def _chosen(found: Solution, modes: int) -> Solution:
     energy = found.energy
     taken = torch.zeros_like(energy, dtype=torch.bool)
     taken[:, 0] = True
-    repeats = _same(found.states)
+    repeats = same_motion(found.states)
     chosen = [torch.zeros_like(energy[:, 0], dtype=torch.long)]
     for _ in range(modes - 1):
         repeated = (repeats & taken[:, None]).any(-1)
@@ -149,10 +145,3 @@ def _chosen(found: Solution, modes: int) -> Solution:
     rows = torch.arange(len(energy), device=energy.device)[:, None]
     index = torch.stack(chosen, 1)
     return found.map(lambda tensor: tensor[rows, index])
-
-
-def _same(states: Tensor) -> Tensor:
-    """Whether two solutions of a scene are the same, [B, C, C]."""
-    position = states[..., :2]
-    apart = (position[:, :, None] - position[:, None]).norm(dim=-1)
-    return (apart < DISTINCT).flatten(3).all(-1)

@@ -1,0 +1,59 @@
+"""Modes that repeat an earlier one: they are one outcome, and have one probability."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float, Int, Shaped
+from torch import Tensor
+
+from epo_lightning.decoders.orders import repeated
+from epo_lightning.forecast import same_motion
+
+
+def without_repeated_choices(logits: Float[Tensor, "B M"], choices: Shaped[Tensor, "B M D"]) -> Float[Tensor, "B M"]:
+    """Logits of choices, -inf for a choice that repeats an earlier one: the logit of the earlier one is that of both."""
+    return torch.where(repeated(choices), -torch.inf, logits)
+
+
+def earliest_same(states: Float[Tensor, "B M N K _"], agent_mask: Bool[Tensor, "B N"]) -> Int[Tensor, "B M"]:
+    """Index of the earliest mode with the same motion (:func:`~epo_lightning.forecast.same_motion`), perhaps its own."""
+    modes = states.shape[1]
+    present = torch.where(agent_mask[:, None, :, None, None], states, 0.0)
+    itself = torch.eye(modes, dtype=torch.bool, device=states.device)
+    index = (same_motion(present) | itself).to(torch.uint8).argmax(-1)
+    for _ in range(modes - 2):  # motions in a chain, each the same as the one before, are one outcome
+        index = index.gather(1, index)
+    return index
+
+
+def repeats_joined(
+    states: Float[Tensor, "B M N K 4"],
+    controls: Float[Tensor, "B M N K 2"],
+    logits: Float[Tensor, "B M"],
+    agent_mask: Bool[Tensor, "B N"],
+) -> tuple[Float[Tensor, "B M N K 4"], Float[Tensor, "B M N K 2"], Float[Tensor, "B M"]]:
+    """States, controls and logits of modes of which some have the same motion, and are one outcome.
+
+    The earliest of them has the probability of all. The others have a probability of zero, and its states and controls, so
+    that a score which takes the closest of equal modes takes the earliest one.
+    """
+    earliest = earliest_same(states, agent_mask)
+    scenes = torch.arange(len(states), device=states.device)[:, None]
+    return states[scenes, earliest], controls[scenes, earliest], with_repeats_added(logits, earliest)
+
+
+def with_repeats_added(logits: Float[Tensor, "B M"], earliest: Int[Tensor, "B M"]) -> Float[Tensor, "B M"]:
+    """Logits of modes after their repetitions were added: those of a repeated outcome are summed as probabilities.
+
+    Args:
+        logits: one logit per mode, repetitions included, as a network decodes them.
+        earliest: index of the earliest mode with the same motion (:func:`earliest_same`).
+
+    Returns:
+        The logit of the sum for the earliest mode, and -inf for the modes that repeat it.
+    """
+    index = torch.arange(logits.shape[1], device=logits.device)
+    # Repetitions keep themselves in their own sum, so that no sum is empty, which would have no derivative.
+    belongs = (earliest[..., None] == index) | (index[:, None] == index)
+    total = torch.where(belongs, logits[..., None], -torch.inf).logsumexp(1)
+    return torch.where(earliest == index, total, -torch.inf)

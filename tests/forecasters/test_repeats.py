@@ -1,0 +1,114 @@
+"""Modes that repeat an earlier one, against slow versions; and forecasts of games with fewer equilibria than modes."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import hypothesis.strategies as st
+import pytest
+import torch
+from hypothesis import given
+from test_game_horizon import SOLVER, built, scenes
+from torch import Tensor
+
+from epo_lightning.forecast import DISTINCT, same_motion
+from epo_lightning.forecasters.repeats import earliest_same, with_repeats_added
+from epo_lightning.metrics.functional import brier_min_sade
+
+
+def motions(offsets: list[float], agents: int = 2) -> Tensor:
+    """One scene [1, M, N, K=3, 4], whose modes differ in the last position of the last agent, by multiples of DISTINCT."""
+    states = torch.zeros(1, len(offsets), agents, 3, 4, dtype=torch.double)
+    states[0, :, -1, -1, 1] = DISTINCT * torch.tensor(offsets, dtype=torch.double)
+    return states
+
+
+def everyone(agents: int = 2) -> Tensor:
+    return torch.ones(1, agents, dtype=torch.bool)
+
+
+@pytest.mark.parametrize(
+    ("offsets", "earliest"),
+    [
+        ([0.0], [0]),
+        ([0.0, 0.5], [0, 0]),
+        ([0.0, 1.5], [0, 1]),
+        ([3.0, 0.0, 2.5, 0.1], [0, 1, 0, 1]),
+        ([0.0, 0.9, 1.8, 2.7, 3.6], [0, 0, 0, 0, 0]),  # a chain
+        ([0.0, math.nan, math.nan, 0.1], [0, 1, 2, 0]),
+    ],
+)
+def test_a_mode_repeats_the_earliest_one_with_the_same_motion(offsets: list[float], earliest: list[int]) -> None:
+    assert earliest_same(motions(offsets), everyone()).tolist() == [earliest]
+
+
+def test_headings_and_speeds_do_not_make_motions_different() -> None:
+    states = motions([0.0, 0.0])
+    states[0, 1, ..., 2:] = 7.0
+    assert same_motion(states).all()
+
+
+def test_agents_that_do_not_exist_do_not_make_motions_different() -> None:
+    states, mask = motions([0.0, 5.0]), everyone()
+    assert earliest_same(states, mask).tolist() == [[0, 1]]
+    mask[0, 1] = False
+    assert earliest_same(states, mask).tolist() == [[0, 0]]
+    states[0, 1, 1] = math.nan
+    assert earliest_same(states, mask).tolist() == [[0, 0]]
+
+
+@st.composite
+def repeated(draw: st.DrawFn) -> tuple[list[float], list[int]]:
+    """Logits of modes, and for every mode the earliest one that it repeats."""
+    count = draw(st.integers(1, 5))
+    earliest: list[int] = []
+    for mode in range(count):
+        earliest.append(draw(st.sampled_from([*sorted({*earliest}), mode])))
+    return draw(st.lists(st.floats(-30, 30), min_size=count, max_size=count)), earliest
+
+
+@given(repeated())
+def test_probabilities_of_repetitions_are_summed(case: tuple[list[float], list[int]]) -> None:
+    logits, earliest = case
+    decoded = torch.tensor([logits], dtype=torch.double, requires_grad=True)
+    found = with_repeats_added(decoded, torch.tensor([earliest])).softmax(1)
+    before = torch.tensor(logits, dtype=torch.double).softmax(0).tolist()
+    expected = [
+        sum(p for p, first in zip(before, earliest, strict=True) if first == mode) for mode in range(len(logits))
+    ]
+    assert found[0].tolist() == pytest.approx(expected, abs=1e-12)
+    for mode in {*earliest}:
+        (gradient,) = torch.autograd.grad(found[0, mode], decoded, retain_graph=True)
+        inside = torch.tensor([first == mode for first in earliest])
+        # The derivative of a sum of softmax values p by logit l_k is p_k ([k in the sum] - sum).
+        softmax = torch.tensor(before, dtype=torch.double)
+        torch.testing.assert_close(gradient[0], softmax * (inside.double() - expected[mode]), atol=1e-12, rtol=1e-9)
+
+
+def test_logits_without_repetitions_are_unchanged() -> None:
+    logits = torch.randn(4, 3)
+    assert torch.equal(with_repeats_added(logits, torch.arange(3).expand(4, 3)), logits)
+
+
+def test_a_game_with_one_equilibrium_has_one_outcome() -> None:
+    """Two agents far from each other: both initial strategies lead to the same equilibrium, which gets all probability."""
+    scene = scenes()
+    history, goals = scene.history.clone(), scene.goal_candidates.clone()
+    history[:, 1, :, 1] += 1000.0
+    goals[:, 1, :, 1] += 1000.0
+    scene = dataclasses.replace(scene, history=history, goal_candidates=goals)
+    forecaster = built(calibration=None, solver={**SOLVER, "steps": 40, "newton_steps": 5})
+    forecast = forecaster.predict(scene)
+    assert forecast.solution is not None
+    assert not torch.equal(forecast.solution.states[:, 0], forecast.solution.states[:, 1])
+    assert forecast.probabilities.tolist() == [[1.0, 0.0]] * 3
+    assert torch.equal(forecast.states[:, 0], forecast.states[:, 1])
+    assert forecast.controls is not None
+    assert torch.equal(forecast.controls[:, 0], forecast.controls[:, 1])
+    # The repetition is as close to any future as the mode that it repeats, so scores take the probability of the first.
+    future = forecast.states[:, 1]
+    score = brier_min_sade(
+        forecast.states, forecast.probabilities, future, torch.ones(future.shape[:3], dtype=torch.bool)
+    )
+    assert score.tolist() == [0.0] * 3
