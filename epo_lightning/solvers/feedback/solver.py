@@ -19,6 +19,7 @@ from epo_lightning.solvers.base import STATIONARY, Minimiser
 from epo_lightning.solvers.feedback import derivative, iteration, kernel
 from epo_lightning.solvers.feedback.iteration import FeedbackGame
 from epo_lightning.solvers.gauss_newton.both_sides import BothSides
+from epo_lightning.solvers.gauss_newton.kernel import interface
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 from epo_lightning.solvers.general import descent
 
@@ -106,11 +107,18 @@ class ToFeedback(Minimiser):
 
 
 def _checked(energy: Energy) -> FeatureEnergy:
-    """The energy, whose features are all of single time steps.
+    """The energy, whose features are all of single time steps, and whose LQ games the compiled layer solves.
 
     Raises:
         ValueError: it is another one; the message names the features.
+        ConfigError: the compiled layer is missing, and nothing can take its place.
     """
+    library = interface.find()
+    if isinstance(library, str):
+        raise ConfigError(
+            f"solver=feedback needs the compiled layer of this package, which is missing: {library}. Games of agents that "
+            "do not react to each other are solved without it (solver=both_sides)"
+        )
     if not isinstance(energy, FeatureEnergy):
         raise ValueError(f"solver=feedback takes energy=features, not {type(energy).__name__}")
     if energy.between_steps:

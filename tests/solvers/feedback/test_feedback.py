@@ -24,6 +24,7 @@ from epo_lightning.solvers.feedback import derivative, iteration
 from epo_lightning.solvers.feedback.anderson import Anderson
 from epo_lightning.solvers.feedback.lq_game import LQGame, Policy
 from epo_lightning.solvers.feedback.solver import Feedback
+from epo_lightning.solvers.gauss_newton.kernel import interface
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
 ENERGY = FeatureEnergy(own=["goal", "vel", "acc", "turnr"], pair=["clearance"], margins={"clearance": 0.5})
@@ -260,6 +261,14 @@ def test_a_hessian_without_second_derivatives_is_refused() -> None:
     scene, game = meeting(2.3)
     with pytest.raises(ConfigError, match=r"backward\.hessian=gauss_newton has no effect with solver=feedback"):
         Implicit(hessian="gauss_newton")(Feedback(), ENERGY, scene, leaves_of(game))
+
+
+def test_a_missing_library_is_named_before_anything_is_solved(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, parameters = meeting(0.5)
+    monkeypatch.setattr(interface, "find", lambda: "it was not built")
+    for solver in (Feedback(), Feedback(backend="pytorch"), Feedback().descent()):
+        with pytest.raises(ConfigError, match=r"solver=feedback needs the compiled layer .* missing: it was not built"):
+            solver(ENERGY, scene, parameters)
 
 
 def test_only_solved_games_have_a_gradient_and_many_others_a_warning() -> None:
