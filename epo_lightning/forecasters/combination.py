@@ -19,7 +19,8 @@ WORDS = {
     GRADIENT: "a gradient",
     RESIDUALS: "residuals (it must be half the sum of their squares)",
     FEATURES: "named features whose structure the solver knows",
-    STAGES: "features of single time steps alone, such as energy=rpi_game (no jerk or other rates, no steering)",
+    STAGES: "features of the states or of the controls of single time steps alone, such as energy=rpi_game (no jerk or "
+    "other rates, no steering)",
     PATH: "a path that can be differentiated",
     STEPS: "steps that can be interrupted and continued",
     STATIONARY: "solutions with an implicit derivative",

@@ -209,7 +209,7 @@ def signal_and_change(
     the last state of the game; the other signals go on after its end.
 
     Args:
-        feature: the feature, with any source but TRAJECTORY.
+        feature: a declared feature.
         states, controls: the trajectories.
         moved, directions: the changes of states and controls.
         around: the other inputs of the signal.
@@ -331,6 +331,31 @@ def undeclared_change(
     )(*directions)
 
 
+def derivatives_of_steps(
+    function: Callable[..., Tensor], at: tuple[Tensor, Tensor], *others: Tensor
+) -> tuple[Float[Tensor, "*batch K"], list[Float[Tensor, "*batch K _"]]]:
+    """Value of a function of single steps, and its derivatives by the numbers of each step in its two tensors.
+
+    Arguments are those of :func:`undeclared_change`. The changes along any number of directions follow from these few.
+    """
+    sizes = [tensor.shape[-1] for tensor in at]
+    unit = torch.eye(sum(sizes), dtype=at[0].dtype, device=at[0].device)
+    unit = unit.view(-1, *[1] * (at[0].dim() - 1), sum(sizes)).expand(-1, *at[0].shape[:-1], -1)
+    first, second = unit.split(sizes, -1)
+    value, by = undeclared_change(function, at, (first, second), *others)
+    return value, [part.movedim(0, -1) for part in by.split(sizes)]
+
+
+def stepwise_change(
+    function: Callable[..., Tensor], at: tuple[Tensor, Tensor], directions: tuple[Tensor, Tensor]
+) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "D *batch K"]]:
+    """The same as :func:`undeclared_change`, for a function of single steps."""
+    if len(directions[0]) <= sum(tensor.shape[-1] for tensor in at):
+        return undeclared_change(function, at, directions)
+    value, (by_first, by_second) = derivatives_of_steps(function, at)
+    return value, (by_first * directions[0]).sum(-1) + (by_second * directions[1]).sum(-1)
+
+
 def undeclared_change_by_agent(
     feature: PairFeature,
     both: tuple[Tensor, Tensor],
@@ -347,14 +372,9 @@ def undeclared_change_by_agent(
         others: lengths and widths of both and the margin, for features that need them.
         ends: number of evaluated steps in the game of every row, for functions that are not stepwise.
     """
-    # A residual of one step has only eight derivatives: by the 4 + 4 numbers of both states. The changes follow from these.
     if feature.stepwise:
-        unit = torch.eye(8, dtype=both[0].dtype, device=both[0].device)
-        unit = unit.view(8, *[1] * (both[0].dim() - 1), 8).expand(-1, *both[0].shape[:-1], -1)
-        value, by_state = undeclared_change(feature.function, both, (unit[..., :4], unit[..., 4:]), *others)
-        by_first, by_second = (
-            (one.movedim(0, -1) * side).sum(-1) for one, side in zip(by_state.split(4), moved, strict=True)
-        )
+        value, by = derivatives_of_steps(feature.function, both, *others)
+        by_first, by_second = ((one * side).sum(-1) for one, side in zip(by, moved, strict=True))
         return value, by_first, by_second
     first, second = moved
     still = torch.zeros_like(first)

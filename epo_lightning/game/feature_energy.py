@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -20,9 +20,11 @@ from epo_lightning.game.feature_derivatives import (
     own_derivatives,
     pair_derivatives,
     signal_and_change,
+    stepwise_change,
     undeclared_change,
 )
 from epo_lightning.game.feature_inputs import FeatureInputs
+from epo_lightning.game.features import BUILT_IN, Source
 from epo_lightning.game.game_end import until
 from epo_lightning.game.pairs import pairs
 from epo_lightning.registry import register
@@ -82,6 +84,23 @@ class FeatureEnergy(FeatureInputs):
         """The part of the energy whose derivatives need automatic differentiation; None if all features are declared."""
         own = [name for name, feature in self.own_features.items() if not feature.declared]
         pair = [name for name, feature in self.pair_features.items() if not feature.declared]
+        return self._part(own, pair)
+
+    @cached_property
+    def built_in(self) -> FeatureEnergy | None:
+        """The part of the energy whose features are built in, which kernels know; None if there are none."""
+        return self._part(
+            [name for name in self.own if name in BUILT_IN], [name for name in self.pair if name in BUILT_IN]
+        )
+
+    @cached_property
+    def custom(self) -> FeatureEnergy | None:
+        """The part of the energy whose features are functions of the user; None if there are none."""
+        return self._part(
+            [name for name in self.own if name not in BUILT_IN], [name for name in self.pair if name not in BUILT_IN]
+        )
+
+    def _part(self, own: Sequence[str], pair: Sequence[str]) -> FeatureEnergy | None:
         return dataclasses.replace(self, own=own, pair=pair) if own or pair else None
 
     def residuals(
@@ -168,9 +187,14 @@ class FeatureEnergy(FeatureInputs):
             change = change if first is None else first * change
         else:
             assert feature.function is not None
-            value, change = undeclared_change(until(feature.function, scene.game_steps), at, moved)
-            present = scene.agent_mask[:, None, :, None]
-            value, change = torch.where(present, value, 0.0), torch.where(present, change, 0.0)
+            exists = scene.agent_mask[:, None, :, None]
+            if feature.source is Source.STEP:
+                value, change = stepwise_change(feature.function, at, moved)
+                mask = self.residual_mask(scene, feature, at[1].shape[-2])
+                exists = exists if mask is None else exists & mask
+            else:
+                value, change = undeclared_change(until(feature.function, scene.game_steps), at, moved)
+            value, change = torch.where(exists, value, 0.0), torch.where(exists, change, 0.0)
         weight = self.own_weight(scene, parameters, name)[..., None]
         return weight * value, weight * change
 

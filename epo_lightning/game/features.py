@@ -70,6 +70,9 @@ class Source(Enum):
     """The last heading: it is the sum of all turn rates."""
     DISTANCE = "distance"
     """The distance between two agents: it depends on the positions of both."""
+    STEP = "step"
+    """States and controls of single steps, with one residual per step: its few derivatives, by the state after the step and
+    by the control of the step, are found by automatic differentiation."""
     TRAJECTORY = "trajectory"
     """Undeclared: the Jacobian is found by automatic differentiation."""
 
@@ -85,7 +88,7 @@ class OwnFeature:
         bounded: whether the feature is zero within the bounds.
         needs: further input of the signal: ``goals``, ``goal_headings``, ``reference``, ``reference_speed``,
             ``reference_controls``, ``size``; None for no other input.
-        function: elementwise function of the signal, or of states and controls for the source TRAJECTORY.
+        function: elementwise function of the signal, or of states and controls for the sources STEP and TRAJECTORY.
     """
 
     source: Source
@@ -97,13 +100,13 @@ class OwnFeature:
 
     @property
     def declared(self) -> bool:
-        """Whether the source is declared, so that the Jacobian is known in closed form."""
-        return self.source is not Source.TRAJECTORY
+        """Whether the feature is a function of a known signal, so that the Jacobian is known in closed form."""
+        return self.source not in (Source.STEP, Source.TRAJECTORY)
 
     @property
     def stepwise(self) -> bool:
-        """Whether the feature depends on the control and the next state of single time steps."""
-        return self.source not in (Source.RATE, Source.STEERING, Source.TRAJECTORY)
+        """Whether every residual depends on the control or on the next state of a single time step, and not on both."""
+        return self.source not in (Source.RATE, Source.STEERING, Source.STEP, Source.TRAJECTORY)
 
     @property
     def linear(self) -> bool:
@@ -119,10 +122,9 @@ class OwnFeature:
             takes = "It takes one signal [.., K] and returns a value for each of its values, [.., K]"
             return trials.flaw(self.function, [trials.numbers()], [], takes)
         states, _ = trials.agents()[0]
-        takes = (
-            "It takes states [.., K, 4] and controls [.., K, 2] and returns residuals [.., R]; a single one is [.., 1]"
-        )
-        return trials.flaw(self.function, [states, trials.numbers(2)], [], takes)
+        stepwise = self.source is Source.STEP
+        takes = f"It takes states [.., K, 4] and controls [.., K, 2] and returns {_residuals(stepwise)}"
+        return trials.flaw(self.function, [states, trials.numbers(2)], [], takes, stepwise)
 
 
 @dataclass(frozen=True)
@@ -130,11 +132,10 @@ class PairFeature:
     """One entry of d(u_i, u_j) in Eq. 11.
 
     Attributes:
-        source: DISTANCE or TRAJECTORY.
-        function: elementwise function of distance and reach; for the source TRAJECTORY, function of the states of both
-            agents, and of their sizes if it needs them.
+        source: DISTANCE, STEP or TRAJECTORY.
+        function: elementwise function of distance and reach; for the sources STEP and TRAJECTORY, function of the states of
+            both agents, and of their sizes if it needs them.
         needs: ``size`` for a function of states that takes the agents' sizes too.
-        stepwise: whether a function of states returns one residual per step that depends only on the states at that step.
         extent: function from an agent's size to the radius [m] around its position within which it can affect others,
             besides a margin; None if there is no limit.
         margin: whether the feature takes a margin, an additional distance [m] of every pair: it is added to the reach, or
@@ -144,7 +145,6 @@ class PairFeature:
     source: Source
     function: Callable[..., Tensor]
     needs: str | None = None
-    stepwise: bool = False
     extent: Callable[[Tensor], Tensor] | None = None
     margin: bool = False
 
@@ -152,6 +152,11 @@ class PairFeature:
     def declared(self) -> bool:
         """Whether the feature is a function of the distance, so that its Jacobian is known in closed form."""
         return self.source is Source.DISTANCE
+
+    @property
+    def stepwise(self) -> bool:
+        """Whether a function of states returns one residual per step, which depends only on the states at that step."""
+        return self.source is Source.STEP
 
     @cached_property
     def flaw(self) -> str | None:
@@ -164,9 +169,9 @@ class PairFeature:
         with_sizes = " and sizes [.., 1, 2]" if self.needs else ""
         takes = (
             f"It takes the states [.., K, 4]{with_sizes} of two agents{' and a margin [.., 1]' if self.margin else ''} "
-            "and returns residuals [.., R]; a single one is [.., 1]"
+            f"and returns {_residuals(self.stepwise)}"
         )
-        return trials.flaw(self.function, states, [*(sizes if self.needs else ()), *margin], takes)
+        return trials.flaw(self.function, states, [*(sizes if self.needs else ()), *margin], takes, self.stepwise)
 
     @cached_property
     def asymmetry(self) -> tuple[float, float] | None:
@@ -174,6 +179,11 @@ class PairFeature:
         if self.declared:
             return None
         return symmetry.difference(self.function, sizes=self.needs == "size", margin=self.margin)
+
+
+def _residuals(stepwise: bool) -> str:
+    """What a function of trajectories returns, in words."""
+    return "one residual per step, [.., K]" if stepwise else "residuals [.., R]; a single one is [.., 1]"
 
 
 def _with_bounds(features: Mapping[str, OwnFeature]) -> dict[str, OwnFeature]:
@@ -210,13 +220,13 @@ choose by itself (``GameParameters.reference_controls``); ``...b``, the amount b
 
 
 def _of_vehicles(function: Callable[..., Tensor], extent: Callable[[Tensor], Tensor] | None = None) -> PairFeature:
-    return PairFeature(Source.TRAJECTORY, function, needs="size", stepwise=True, extent=extent, margin=True)
+    return PairFeature(Source.STEP, function, needs="size", extent=extent, margin=True)
 
 
 PAIR_FEATURES: dict[str, PairFeature] = {
     "proximity": PairFeature(Source.DISTANCE, overlap, extent=disc),
     "clearance": PairFeature(Source.DISTANCE, overlap, extent=disc, margin=True),
-    "circles": PairFeature(Source.TRAJECTORY, row_overlap, needs="size", stepwise=True, extent=row_extent),
+    "circles": PairFeature(Source.STEP, row_overlap, needs="size", extent=row_extent),
     "headway": _of_vehicles(headway),
     "longitudinal": _of_vehicles(longitudinal, half_sizes),
     "lateral": _of_vehicles(lateral, half_sizes),
@@ -259,16 +269,17 @@ def own_feature(
 
     Args:
         name: the feature's name in ``energy.own``.
-        source: CONTROL, RATE or SPEED for an elementwise function of that one signal; TRAJECTORY for any differentiable
-            function from an agent's states [.., K, 4] and controls [.., K, 2] to residuals [.., R], independently for all
-            leading dimensions.
+        source: CONTROL, RATE or SPEED for an elementwise function of that one signal. STEP for a differentiable function
+            from an agent's states [.., K, 4] and controls [.., K, 2] to residuals [.., K], where residual k depends on the
+            entries k of both alone. TRAJECTORY for any differentiable function of both to residuals [.., R]. All of them
+            work independently for all leading dimensions.
         channel: ``ACCELERATION`` or ``TURN_RATE``, for signals of controls.
 
     Raises:
         ConfigError: the name of a built-in feature or of one in another module, or a source that custom functions cannot
             have.
     """
-    _refuse(name, source, (Source.CONTROL, Source.RATE, Source.SPEED, Source.TRAJECTORY))
+    _refuse(name, source, (Source.CONTROL, Source.RATE, Source.SPEED, Source.STEP, Source.TRAJECTORY))
 
     def add(function: Function) -> Function:
         _refuse_another("own", name, OWN_FEATURES.get(name), function)
@@ -285,10 +296,12 @@ def pair_feature(
 
     Args:
         name: the feature's name in ``energy.pair``.
-        source: DISTANCE for an elementwise function of distance [.., K] and reach [.., 1], the sum of both radii;
-            TRAJECTORY for any differentiable function from the states [.., K, 4] of the first and of the second agent to
-            residuals [.., R], independently for all leading dimensions. Energies refuse a function whose sum of squares
-            changes when the two agents are swapped. K counts only the steps at which the energy evaluates pairs.
+        source: DISTANCE for an elementwise function of distance [.., K] and reach [.., 1], the sum of both radii. STEP for a
+            differentiable function from the states [.., K, 4] of the first and of the second agent to residuals [.., K],
+            where residual k depends on the states k alone. TRAJECTORY for any differentiable function of the states to
+            residuals [.., R]. All of them work independently for all leading dimensions. Energies refuse a function whose
+            sum of squares changes when the two agents are swapped. K counts only the steps at which the energy evaluates
+            pairs.
         needs: ``size`` for a function of states that also takes the lengths and widths [.., 1, 2] of the first and of the
             second agent, zero for absent agents.
         margin: whether pairs have a margin [m], decoded or fixed by ``energy.margins``. It is added to the reach; a function
@@ -298,10 +311,10 @@ def pair_feature(
         ConfigError: the name of a built-in feature or of one in another module, a source that custom functions cannot
             have, or an unknown need.
     """
-    _refuse(name, source, (Source.DISTANCE, Source.TRAJECTORY))
-    if needs is not None and (needs != "size" or source is not Source.TRAJECTORY):
+    _refuse(name, source, (Source.DISTANCE, Source.STEP, Source.TRAJECTORY))
+    if needs is not None and (needs != "size" or source is Source.DISTANCE):
         raise ConfigError(
-            f"pair feature {name!r} can need 'size' if it is a function of states (Source.TRAJECTORY), "
+            f"pair feature {name!r} can need 'size' if it is a function of states (Source.STEP or Source.TRAJECTORY), "
             f"not {needs!r} as {source.name}"
         )
 

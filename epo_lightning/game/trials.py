@@ -59,7 +59,13 @@ def numbers(*shape: int) -> Float[Tensor, "*batch K *shape"]:
 
 
 @torch.inference_mode(False)
-def flaw(function: Callable[..., Tensor], moving: Sequence[Tensor], others: Sequence[Tensor], takes: str) -> str | None:
+def flaw(
+    function: Callable[..., Tensor],
+    moving: Sequence[Tensor],
+    others: Sequence[Tensor],
+    takes: str,
+    stepwise: bool = False,
+) -> str | None:
     """Reason why a function is of no use as a feature, as the end of a sentence about it; None where nothing is wrong.
 
     Warns of a function that stops at the trial arguments with a RuntimeError or ValueError: it may be made for another
@@ -72,6 +78,7 @@ def flaw(function: Callable[..., Tensor], moving: Sequence[Tensor], others: Sequ
             others return residuals [.., R].
         others: further trial arguments.
         takes: what the function takes and returns, in words.
+        stepwise: whether the function is declared to return a residual per step that depends on this step alone.
     """
     moving, others = ([argument[:, :_FEW] for argument in arguments] for arguments in (moving, others))
     errors: list[Exception] = []
@@ -79,7 +86,7 @@ def flaw(function: Callable[..., Tensor], moving: Sequence[Tensor], others: Sequ
         for dtype in (torch.float64, torch.float32):  # a function may hold parameters of single precision
             arguments = [m.to(dtype) for m in moving], [other.to(dtype) for other in others]
             try:
-                reason = _flaw(function, *arguments, takes)
+                reason = _flaw(function, *arguments, takes, stepwise)
                 share = 0.0 if reason or dtype == torch.float32 else _detached(function, *arguments)
             except Exception as error:
                 errors.append(error)
@@ -104,7 +111,9 @@ def flaw(function: Callable[..., Tensor], moving: Sequence[Tensor], others: Sequ
     return None
 
 
-def _flaw(function: Callable[..., Tensor], moving: list[Tensor], others: list[Tensor], takes: str) -> str | None:
+def _flaw(
+    function: Callable[..., Tensor], moving: list[Tensor], others: list[Tensor], takes: str, stepwise: bool
+) -> str | None:
     """Reason as :func:`flaw` gives it; errors of the function are raised."""
 
     def call(*arguments: Tensor) -> Any:  # a wrong function may return anything
@@ -120,20 +129,29 @@ def _flaw(function: Callable[..., Tensor], moving: list[Tensor], others: list[Te
     if not isinstance(value, Tensor) or not value.is_floating_point():
         kind = f"tensor of {value.dtype}" if isinstance(value, Tensor) else type(value).__name__
         return f"returns a {kind}, and not a tensor of floating-point numbers. {takes}"
-    if (value.shape != moving[0].shape) if elementwise else (value.dim() != 3 or value.shape[:2] != (SHAPE[0], _FEW)):
+    by_step = elementwise or stepwise  # one value per step
+    if (value.shape != moving[0].shape[:3]) if by_step else (value.dim() != 3 or value.shape[:2] != (SHAPE[0], _FEW)):
         shapes = " and ".join(str(list(argument.shape)) for argument in (*moving, *others))
         return f"returns the shape {list(value.shape)} for arguments of the shapes {shapes}. {takes}"
     # One value of one trajectory is changed: nothing else may change, of a signal no other step of it either.
     changed = [argument.clone() for argument in moving]
     for argument in changed:
         argument[0, 0, argument.shape[2] // 2] += 1.0
+    middle = value.shape[2] // 2
     with torch.no_grad():
         differs = ~torch.isclose(call(*changed, *others), value, rtol=1e-5, atol=1e-5, equal_nan=True)
-    differs[0, 0, value.shape[2] // 2 if elementwise else slice(None)] = False
+        differs[0, 0, middle if by_step else slice(None)] = False
+        if by_step:  # and if all other steps are changed, this one must stay
+            drawn = torch.Generator().manual_seed(4)
+            changed = [m + torch.rand(m.shape, generator=drawn, dtype=m.dtype, device="cpu") for m in moving]
+            for argument, old in zip(changed, moving, strict=True):
+                argument[:, :, middle] = old[:, :, middle]
+            moved = call(*changed, *others)[:, :, middle]
+            differs[:, :, middle] |= ~torch.isclose(moved, value[:, :, middle], rtol=1e-5, atol=1e-5, equal_nan=True)
     if differs.any():
-        what = (
-            "elementwise: a value depends on other ones" if elementwise else "a function of one agent (or pair) alone"
-        )
+        what = "a function of one agent (or pair) alone"
+        if by_step:
+            what = "elementwise: a value depends on other ones" if elementwise else "a function of single steps alone"
         return f"is not {what}. {takes}"
     drawn = torch.Generator().manual_seed(2)
     tangents = tuple(torch.rand(m.shape, generator=drawn, dtype=m.dtype, device="cpu") for m in moving)

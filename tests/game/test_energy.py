@@ -268,6 +268,30 @@ def test_a_declared_feature_equals_the_same_function_undeclared(registry, stride
         torch.testing.assert_close(declared, undeclared, rtol=0, atol=1e-12 * declared.abs().max().item())
 
 
+@pytest.mark.parametrize("count", [2, 13])
+def test_functions_of_steps_have_the_changes_of_functions_of_trajectories(registry, count):
+    """Along few directions each is differentiated; along many the changes follow from the derivatives of single steps."""
+
+    def gap(first, second):
+        return (first[..., :2] - second[..., :2]).square().sum(-1) + (first[..., 2] - second[..., 2]).cos()
+
+    for name, source in (("mine", Source.STEP), ("theirs", Source.TRAJECTORY)):
+        own_feature(name, source)(lambda states, controls: states[..., 3] * controls[..., 1] + states[..., 2].sin())
+        pair_feature(name, source)(gap)
+    scene = random_scene(3, 3, history=2, dtype=torch.float64)
+    scene.agent_mask[1, 1] = False
+    scene = replaced(scene, game_steps=torch.tensor([6, 4, 1]))
+    game = random_game(scene, horizon=6)
+    weight, pair = game.own_weights["acc"], game.pair_weights["proximity"]
+    directions = torch.randn(count, *game.initial_controls.shape, dtype=torch.float64)
+    found = []
+    for name in ("mine", "theirs"):
+        game = replaced(game, own_weights={name: weight}, pair_weights={name: pair})
+        found.append(FeatureEnergy([name], [name]).linearisation(scene, game, game.initial_controls, directions))
+    for mine, theirs in zip(*found, strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=1e-12, atol=1e-12)
+
+
 def test_bad_declarations_are_refused(registry):
     with pytest.raises(ConfigError, match="built-in"):
         own_feature("acc")

@@ -80,7 +80,7 @@ def test_sizes_are_swapped_with_their_agents():
 
 
 def test_the_built_in_features_are_symmetric():
-    assert any(feature.source is Source.TRAJECTORY for feature in PAIR_FEATURES.values())
+    assert any(feature.source is Source.STEP for feature in PAIR_FEATURES.values())
     assert all(feature.asymmetry is None for feature in PAIR_FEATURES.values())
 
 

@@ -95,6 +95,28 @@ def test_functions_of_signals(name, source):
     refused("own", name, words)
 
 
+@pytest.mark.parametrize(
+    ("name", "function", "words"),
+    [
+        ("jerky", lambda states, controls: controls[..., 0].cumsum(-1), "is not a function of single steps alone"),
+        (
+            "shape",
+            lambda states, controls: controls[..., 1:, 0],
+            r"returns the shape \[4, 3, 39\].*per step, \[\.\., K\]",
+        ),
+        ("both", lambda states, controls: controls, r"returns the shape \[4, 3, 40, 2\]"),
+    ],
+)
+def test_functions_of_steps(name, function, words):
+    own_feature(name, Source.STEP)(function)
+    refused("own", name, words)
+
+
+def test_functions_of_the_steps_of_pairs():
+    pair_feature("held", Source.STEP)(lambda first, second: (first - second)[..., :1, 0].expand(first.shape[:-1]))
+    refused("pair", "held", "is not a function of single steps alone")
+
+
 @pytest.mark.parametrize("name", OF_PAIRS)
 def test_functions_of_pairs(name):
     function, words = OF_PAIRS[name]

@@ -123,8 +123,8 @@ def _checked(energy: Energy) -> FeatureEnergy:
         raise ValueError(f"solver=feedback takes energy=features, not {type(energy).__name__}")
     if energy.between_steps:
         raise ValueError(
-            f"solver=feedback takes features of single time steps, and not {', '.join(energy.between_steps)}: leave them "
-            "out, or choose another solver"
+            "solver=feedback takes features of the states or of the controls of single time steps, and not "
+            f"{', '.join(energy.between_steps)}: leave them out, or choose another solver"
         )
     return energy
 

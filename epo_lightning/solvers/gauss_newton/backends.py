@@ -1,6 +1,6 @@
 """The implementations of damped steps, and the choice of one of them for a game.
 
-- ``compiled``: the kernel for CPUs (:mod:`.compiled`).
+- ``compiled``: the kernel for CPUs (:mod:`.compiled`). PyTorch helps it with features of the user (:mod:`.assisted`).
 - ``host``: the same kernel for games on a GPU, which are copied (:mod:`.hosted`).
 - ``warp``: fused kernels on a GPU (:mod:`.fused`).
 - ``pytorch``: operations of PyTorch, anywhere and for every game (:mod:`.structured`).
@@ -18,7 +18,7 @@ from torch import Tensor
 from epo_lightning.forecast import GameParameters, Solution
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import Scene
-from epo_lightning.solvers.gauss_newton import compiled, fused, hosted, structured
+from epo_lightning.solvers.gauss_newton import assisted, compiled, fused, hosted, structured
 from epo_lightning.warp_kernels import installed
 
 NAMES = ("auto", "pytorch", "compiled", "host", "warp")
@@ -73,7 +73,14 @@ def with_kernel(backend: Backend) -> KernelBackend | None:
     return next((one for one in (compiled, hosted) if one is backend), None)
 
 
-def choose(name: str, energy: FeatureEnergy, scene: Scene, parameters: GameParameters, fixed: bool = False) -> Backend:
+def choose(
+    name: str,
+    energy: FeatureEnergy,
+    scene: Scene,
+    parameters: GameParameters,
+    fixed: bool = False,
+    exact: bool = False,
+) -> Backend:
     """The backend for a game.
 
     Args:
@@ -82,6 +89,7 @@ def choose(name: str, energy: FeatureEnergy, scene: Scene, parameters: GameParam
             different times, of which only the host makes use. Where neither can solve the game, it is ``pytorch``.
         energy, scene, parameters: the game.
         fixed: whether all steps are Gauss-Newton steps with the same damping.
+        exact: whether the Hessian is needed, for Newton steps or an implicit derivative.
 
     Raises:
         ValueError: the backend of this name cannot solve the game.
@@ -96,6 +104,10 @@ def choose(name: str, energy: FeatureEnergy, scene: Scene, parameters: GameParam
     obstacle = chosen.obstacle(energy, scene, parameters)
     if obstacle is None:
         return chosen
+    if chosen is compiled and energy.custom is not None and not exact:
+        obstacle = assisted.obstacle(energy, scene, parameters)
+        if obstacle is None:
+            return assisted
     if name != "auto":
         raise ValueError(f"solver.backend is {name!r}, but {obstacle}; 'auto' and 'pytorch' can solve this game")
     if not torch.compiler.is_exporting():

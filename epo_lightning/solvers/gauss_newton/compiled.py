@@ -14,6 +14,7 @@ effect when the call has ended, and no thread can write to memory that was relea
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -73,7 +74,7 @@ def solve(
     The solution is differentiable with respect to weights, margins, targets and initial controls. Problems are shared out
     among ``threads`` threads, by default ``torch.get_num_threads()``; results do not depend on their number.
     """
-    call = _Call(energy, scene, parameters, steps, step_size, damping, keep_iterates, exact=exact, threads=threads)
+    call = Call(energy, scene, parameters, steps, step_size, damping, keep_iterates, exact=exact, threads=threads)
     return take_steps(call, parameters.initial_controls)
 
 
@@ -95,7 +96,7 @@ def descend(
     Returns:
         the solution, and the damping to continue with.
     """
-    call = _Call(
+    call = Call(
         energy, scene, parameters, steps, step_size, damping, False, exact=exact, adaptive=True, threads=threads
     )
     call.run()
@@ -126,7 +127,7 @@ def attach(
     """
     game = dataclasses.replace(parameters, initial_controls=controls.double())
     none = game.initial_controls.new_zeros(controls.shape[:2])
-    call = _Call(energy, scene, game, 1, 1.0, none, False, exact=exact, threads=threads)
+    call = Call(energy, scene, game, 1, 1.0, none, False, exact=exact, threads=threads)
     if not call.record:
         call.run()
         return controls, _definite(call)
@@ -146,7 +147,7 @@ class _Tape:
             self._release(self.address)
 
 
-class _Call:
+class Call:
     """One call of the kernel: its arguments as C structures, the arrays behind them, and its results."""
 
     def __init__(
@@ -161,7 +162,18 @@ class _Call:
         exact: bool = False,
         adaptive: bool = False,
         threads: int | None = None,
+        given: Tensor | None = None,
+        beside: Sequence[Tensor] = (),
     ) -> None:
+        """Collect the arguments.
+
+        Args:
+            energy, scene, parameters, steps, step_size, damping, keep_iterates, exact, threads: those of :func:`solve`.
+            adaptive: whether the steps are adaptive (:func:`descend`).
+            given: residuals that the kernel takes as they are (``given`` in `kernel/game.hpp`). The energy of the last
+                iterate is not computed then, because it has other residuals.
+            beside: tensors besides ``inputs`` by which the caller differentiates the steps.
+        """
         controls = parameters.initial_controls
         self.threads = threads or torch.get_num_threads()
         self.controls, self.steps, self.keep_iterates = controls, steps, keep_iterates
@@ -169,7 +181,10 @@ class _Call:
         self.doubles = controls.dtype == torch.float64
         self.arrays = GameArrays(energy, scene, parameters, controls)
         self.game, self.inputs, self.kept = self.arrays.game, self.arrays.inputs, self.arrays.kept
-        self.record = torch.is_grad_enabled() and any(x.requires_grad for x in (controls, *self.inputs))
+        self.record = torch.is_grad_enabled() and any(x.requires_grad for x in (controls, *self.inputs, *beside))
+        self.given = None if given is None else as_type(controls.dtype, given).contiguous()
+        if self.given is not None:
+            self.game.given, self.game.given_count = self.given.data_ptr(), self.given.shape[-2]
         self.tape = _Tape()
         self._reserve(step_size, damping)
 
@@ -201,7 +216,7 @@ class _Call:
             directions=self.directions.data_ptr(),
             states=self.states.data_ptr(),
             initial_energy=self.initial_energy.data_ptr(),
-            energy=self.energy.data_ptr(),
+            energy=self.energy.data_ptr() if self.given is None or not self.steps else None,
             gradient_norm=self.gradient_norm.data_ptr(),
             status=self.status.data_ptr(),
         )
@@ -215,10 +230,13 @@ class _Call:
         arguments = (self.doubles, self.game, self.arguments, self.threads, self.tape.address)
         interface.check(interface.library().epo_solve(*arguments))
 
-    def differentiate(self, controls: Tensor, iterates: Tensor | None, states: Tensor | None) -> list[Tensor]:
+    def differentiate(
+        self, controls: Tensor, iterates: Tensor | None, states: Tensor | None, adjoint: Tensor | None = None
+    ) -> list[Tensor]:
         """Gradients by ``inputs``, for cotangents of the final controls, of all iterates and of the states.
 
-        ``controls`` is overwritten: on return it holds the gradient by the initial controls.
+        ``controls`` is overwritten: on return it holds the gradient by the initial controls. ``adjoint``, zero on entry,
+        becomes mu of a single step.
         """
         gradients, found = self.arrays.new_gradients()
         gradients.controls = controls.data_ptr()
@@ -226,6 +244,8 @@ class _Call:
             gradients.iterates = iterates.data_ptr()
         if states is not None:
             gradients.states = states.data_ptr()
+        if adjoint is not None:
+            gradients.adjoint = adjoint.data_ptr()
         arguments = (self.tape.address, self.game, self.arguments, gradients)
         interface.check(interface.library().epo_differentiate(*arguments))
         return found
@@ -235,7 +255,7 @@ class _Minimum(torch.autograd.Function):
     """Autograd function of the implicit derivative; returns the given controls and a status."""
 
     @staticmethod
-    def forward(ctx: Any, call: _Call, controls: Tensor, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(ctx: Any, call: Call, controls: Tensor, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         call.run()
         status = _definite(call)
         descent.warn_if_far(call.initial_energy, (call.initial_energy - call.energy).abs(), status != Status.STOPPED)
@@ -254,6 +274,6 @@ class _Minimum(torch.autograd.Function):
         return None, None, *ctx.call.differentiate(bar, None, None)
 
 
-def _definite(call: _Call) -> Tensor:
+def _definite(call: Call) -> Tensor:
     """STOPPED for problems whose matrix was not positive definite without damping."""
     return torch.where(call.status == Status.SOLVED, Status.SOLVED, Status.STOPPED)

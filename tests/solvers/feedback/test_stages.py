@@ -11,9 +11,9 @@ from epo_lightning.forecast import GameParameters
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.energy import STAGES
 from epo_lightning.game.feature_energy import FeatureEnergy
-from epo_lightning.game.features import PAIR_FEATURES, PairFeature, Source
+from epo_lightning.game.features import OWN_FEATURES, PAIR_FEATURES, OwnFeature, PairFeature, Source
 from epo_lightning.game.pairs import pairs
-from epo_lightning.scene import Scene
+from epo_lightning.scene import SPEED, TURN_RATE, Scene
 from epo_lightning.solvers.feedback.compiled import CONTROL, STATE
 from epo_lightning.solvers.feedback.lq_game import LQGame
 from epo_lightning.solvers.feedback.solver import Feedback
@@ -116,7 +116,9 @@ def test_agents_alone_and_energies_without_pairs_have_no_pair_costs() -> None:
 def test_features_between_steps_are_refused(name: str) -> None:
     energy, scene, game, _ = setup("euler", 1, None, own=("goal", name))
     assert STAGES not in energy.offers
-    with pytest.raises(ValueError, match=f"takes features of single time steps, and not {name}: leave"):
+    with pytest.raises(
+        ValueError, match=f"takes features of the states or of the controls of single time steps, and not {name}: leave"
+    ):
         Feedback().descent()(energy, scene, game)
 
 
@@ -124,4 +126,10 @@ def test_functions_of_trajectories_are_refused_unless_they_are_of_single_steps(m
     whole = PairFeature(Source.TRAJECTORY, lambda one, other: (one - other)[..., 0].square())
     monkeypatch.setitem(PAIR_FEATURES, "whole", whole)
     assert STAGES not in FeatureEnergy(own=["goal"], pair=["whole"]).offers
+    # The LQ games have no costs of a state and a control together.
+    own = OwnFeature(
+        Source.STEP, "sideways", function=lambda states, controls: states[..., SPEED] * controls[..., TURN_RATE]
+    )
+    monkeypatch.setitem(OWN_FEATURES, "sideways", own)
+    assert STAGES not in FeatureEnergy(own=["goal", "sideways"], pair=["clearance"]).offers
     assert STAGES in FeatureEnergy(own=["goal"], pair=["longitudinal"]).offers

@@ -22,6 +22,10 @@ enum Bounded { BOUND_VEL, BOUND_ACC, BOUND_TURNR, BOUND_JERK, BOUND_TURNACC, BOU
 /// was not possible, and the iterate before it was kept.
 enum Status { SOLVED, DAMPED, STOPPED };
 
+/// Entries of a residual that the caller gives: its value, and its derivatives by x, y, heading and speed after a step and by the
+/// acceleration and the turn rate of the step.
+enum Given { GIVEN_VALUE, GIVEN_X, GIVEN_Y, GIVEN_HEADING, GIVEN_SPEED, GIVEN_ACCELERATION, GIVEN_TURN_RATE, GIVEN_COUNT };
+
 constexpr int64_t kMostAgents = 64;         // contacts are a 64-bit mask per agent
 constexpr double kWheelbase = 0.6;          // distance between the axles as a share of a vehicle's length
 constexpr double kSlowestSteering = 1.0;    // [m/s]; at lower speeds, a steering angle is computed with this speed
@@ -64,6 +68,8 @@ struct EpoGame {
     const void* reference_controls;  // [B, M, N, K, 2], contiguous
     const int64_t* ends;       // [B] numbers of steps of the games, or null if all games have K steps
     int64_t lane_slides;       // whether nearest points of reference lines move with the agents in Gauss-Newton steps
+    const void* given;         // [B, M, N, K, R, GIVEN_COUNT] weighted residuals of features that the kernel does not know, or null
+    int64_t given_count;       // R
 };
 
 /// Arguments and results of S steps from `start`, in which the controls of absent agents are zero. Every array of controls is
@@ -82,7 +88,7 @@ struct EpoRun {
     void* directions;          // [S, ...] if record, else one array of scratch
     void* states;              // [B, M, N, K, 4]
     void* initial_energy;      // [B, M]
-    void* energy;              // [B, M]
+    void* energy;              // [B, M]; null if the result of the steps is not evaluated
     void* gradient_norm;       // [B, M]
     int64_t* status;           // [B, M] of type Status
 };
@@ -99,6 +105,7 @@ struct EpoGradients {
     void* goals;               // [B, M, N, 2], zero on entry
     void* goal_headings;       // [B, M, N], zero on entry
     void* reference_controls;  // [B, M, N, K, 2], zero on entry
+    void* adjoint;             // [B, M, N, K, 2] mu of a single step, zero on entry, for the derivative of given residuals; or null
 };
 
 /// S linear-quadratic games of N agents over K steps, and their equilibria, in double precision; see `solvers/feedback/lq_game.py`.

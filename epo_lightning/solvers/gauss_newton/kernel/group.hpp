@@ -181,12 +181,13 @@ struct Games {
     Vec<T>*weight;                        // [movers, OWN_COUNT]
     Vec<T>*pair_weight, *reach, *margin;  // [PAIR_COUNT, pairs]
     Vec<T>*length, *width;                // [n], only for pair features of states
-    Vec<T>* given;                        // the weights of agents and pairs, of which `enter` sets some to zero; only where `cut`
+    Vec<T>* whole;                        // the weights of agents and pairs, of which `enter` sets some to zero; only where `cut`
     Vec<T> end;                           // numbers of steps of the games; only where `cut`
     Vec<T>*goal_x, *goal_y, *goal_heading, *reference_speed, *wheelbase;  // [movers]
     Nearest<T> nearest;                   // of the movers: from `find_nearest`, or kept by an earlier call
     Vec<T>*turn, *thrust;                 // controls [n, K]
     Vec<T>*reference_turn, *reference_thrust;  // [movers, K], only for features of reference controls
+    Vec<T>* given;                        // [movers, K, R, GIVEN_COUNT], only if there are given residuals
     std::vector<Path<T>> path;
 
     Vec<T> own(int feature, int i) const { return weight[i * OWN_COUNT + feature]; }
@@ -206,7 +207,7 @@ struct Games {
     /// of the state after it, and the rate from step k - 1 to step k, then vanish after the end of a game.
     INLINE void set_weights(int k) const {
         const Mask<T> live = has_step(k);
-        for (int e = 0; cut && e < OWN_COUNT * movers + PAIR_COUNT * pairs; ++e) weight[e] = live ? given[e] : Vec<T>{};
+        for (int e = 0; cut && e < OWN_COUNT * movers + PAIR_COUNT * pairs; ++e) weight[e] = live ? whole[e] : Vec<T>{};
     }
 
     /// The same, in a loop over all steps that goes backwards.
@@ -448,6 +449,15 @@ struct Games {
             reference_thrust = arena.take(movers * K);
             load(movers, static_cast<const T*>(game.reference_controls), reference_turn, reference_thrust);
         }
+        if (game.given) {
+            const int each = int(K * game.given_count) * GIVEN_COUNT;
+            given = arena.take(movers * each);
+            for (int i = 0; i < movers; ++i) {
+                const T* rows[W];
+                for (int lane = 0; lane < W; ++lane) rows[lane] = static_cast<const T*>(game.given) + row_of(i, lane) * each;
+                gather<T>(rows, each, [&](int e, Vec<T> value) { given[i * each + e] = value; });
+            }
+        }
         goal_x = arena.take(movers);
         goal_y = arena.take(movers);
         goal_heading = arena.take(movers);
@@ -497,8 +507,8 @@ struct Games {
                 }
         }
         if (!cut) return;
-        given = arena.take(weights);
-        std::copy(weight, weight + weights, given);
+        whole = arena.take(weights);
+        std::copy(weight, weight + weights, whole);
         for (int lane = 0; lane < W; ++lane) end[lane] = T(game.ends[scene[lane]]);
     }
 

@@ -39,6 +39,8 @@ PAIR = ("proximity", "clearance", "circles", "headway", "longitudinal", "lateral
 """Pair features in the kernel's order."""
 SIGNALS = ("vel", "acc", "turnr", "jerk", "turnacc")
 """Signals with bounds in the kernel's order."""
+GIVEN = 7
+"""Entries of a given residual: its value, and its derivatives by the four numbers of a state and by its two controls."""
 MOST_AGENTS = 64
 """Contacts are a 64-bit mask in the kernel, hence at most 64 agents."""
 
@@ -69,6 +71,8 @@ class EpoGame(ctypes.Structure):
         ("reference_controls", Address),
         ("ends", Address),
         ("lane_slides", Integer),
+        ("given", Address),
+        ("given_count", Integer),
     )
 
 
@@ -101,6 +105,7 @@ class EpoGradients(ctypes.Structure):
         ("goals", Address),
         ("goal_headings", Address),
         ("reference_controls", Address),
+        ("adjoint", Address),
     )
 
 
@@ -158,7 +163,7 @@ def layout() -> dict[str, float]:
         name = structure.__name__
         found[f"sizeof {name}"] = ctypes.sizeof(structure)
         found |= {f"{name}.{field[0]}": getattr(structure, field[0]).offset for field in structure._fields_}
-    found |= {name.upper(): index for index, name in enumerate(OWN)} | {"OWN_COUNT": len(OWN)}
+    found |= {name.upper(): index for index, name in enumerate(OWN)} | {"OWN_COUNT": len(OWN), "GIVEN_COUNT": GIVEN}
     found |= {name.upper(): index for index, name in enumerate(PAIR)} | {"PAIR_COUNT": len(PAIR)}
     found |= {f"BOUND_{name.upper()}": index for index, name in enumerate(SIGNALS)} | {"BOUND_COUNT": len(SIGNALS)}
     found |= {status.name: status.value for status in Status}

@@ -327,7 +327,7 @@ class Range {
             StepTape<T> taken = step(iterate(s), iterate(s + 1), directions, s == 0 ? before : nullptr, nullptr, run_.status);
             if (run_.record) tape->steps.push_back(std::move(taken));
         }
-        measure(iterate(run_.steps), after, static_cast<T*>(run_.states));
+        if (after) measure(iterate(run_.steps), after, static_cast<T*>(run_.states));
         if (run_.steps == 0) std::copy(after + first_, after + last_, before + first_);
         return run_.record ? std::move(tape) : nullptr;
     }
@@ -503,11 +503,12 @@ void differentiate_all(const Tape<T>& tape, const EpoGame& game, const EpoRun& r
                 mu_thrust[e] = T(run.step_size) * bar_thrust[e];
             }
             solve_adjoint(group, factors, mu_turn, mu_thrust);
+            uint32_t taken = 0;
+            for (int lane = 0; lane < filled; ++lane) taken |= uint32_t(step.taken[group.problem[lane] - first] != 0) << lane;
+            if (gradients.adjoint) group.store(mu_turn, mu_thrust, taken, static_cast<T*>(gradients.adjoint));
             const ParameterGradients<T> by(arena, n, K, group.pairs);
             differentiate(group, mu_turn, mu_thrust, d_turn, d_thrust, bar_turn, bar_thrust, by);
             // A step that was not taken passes its cotangent on unchanged.
-            uint32_t taken = 0;
-            for (int lane = 0; lane < filled; ++lane) taken |= uint32_t(step.taken[group.problem[lane] - first] != 0) << lane;
             group.store(bar_turn, bar_thrust, taken, bar);
             add_gradients<T>(group, by, taken, gradients);
         });

@@ -106,6 +106,25 @@ NOINLINE void add_state_pair_costs(const Games<T>& g, int state, bool exact, Vec
     }
 }
 
+/// Adds the costs of given residuals at one state, which also depend on the controls of the step before it; arguments as for
+/// `add_state_costs`.
+template <class T>
+NOINLINE void add_given_costs(const Games<T>& g, int state, Vec<T>* P, Vec<T>* y, Vec<T>& energy) {
+    const int m = 2 * g.movers, ld = 3 * m, count = int(g.game.given_count);
+    for (int i = 0; i < g.movers; ++i) {
+        const Vec<T>* row = g.given + (i * g.K + state - 1) * count * GIVEN_COUNT;
+        // Entries of P and y for the derivatives of a residual, in their order.
+        const int at[] = {2 * i, 2 * i + 1, m + 2 * i, m + 2 * i + 1, 2 * m + unknown(i, ACCELERATION), 2 * m + unknown(i, TURN_RATE)};
+        for (int r = 0; r < count; ++r, row += GIVEN_COUNT) {
+            const Vec<T> value = row[GIVEN_VALUE], *by = row + GIVEN_X;
+            energy += T(0.5) * value * value;
+            for (int e = 0; e < 6; ++e) y[at[e]] += value * by[e];
+            for (int e = 0; P && e < 6; ++e)
+                for (int f = 0; f <= e; ++f) P[std::max(at[e], at[f]) * ld + std::min(at[e], at[f])] += by[e] * by[f];
+        }
+    }
+}
+
 /// Adds the second derivatives of the costs of a state to P [3m, 3m] (unless it is null) and their gradient to y [3m]; returns
 /// their energy. Unless `exact`, the second derivatives of residuals are left out (Gauss-Newton).
 template <class T, int N>
@@ -133,6 +152,7 @@ INLINE Vec<T> add_state_costs(const Group<T, N>& g, int state, bool exact, Vec<T
             P[(2 * i + 1) * ld + 2 * i + 1] -= y_ * y_;
         }
     }
+    if (g.game.given) add_given_costs<T>(g, state, P, y, energy);
     if (!g.pairs_count_at(state)) return energy;
     for (const int feature : {PROXIMITY, CLEARANCE})
         if (g.has_pair(feature)) add_disc_costs(g, feature, state, exact, P, y, energy);
@@ -286,7 +306,7 @@ void solve_adjoint(const Group<T, N>& g, const Factors<T>& factors, Vec<T>* turn
 template <class T, int N>
 void evaluate(const Group<T, N>& g, Vec<T>& energy, Vec<T>& squared_norm) {
     const int n = g.count.agents(), m = 2 * n;
-    Vec<T>* y = g.arena.take(3 * m);  // gradients by positions and by (heading, speed); pulls of the next rates
+    Vec<T>* y = g.arena.take(3 * m);  // gradients by positions, by (heading, speed) and by the controls before the state
     Motion<T>* Z = reinterpret_cast<Motion<T>*>(g.arena.take(4 * n));
     ControlCosts<T> costs(g.arena, n);
     for (int e = 0; e < 3 * m; ++e) y[e] = Vec<T>{};
@@ -298,9 +318,9 @@ void evaluate(const Group<T, N>& g, Vec<T>& energy, Vec<T>& squared_norm) {
         energy += costs.energy;
         g.motions(k, Z);
         for (int r = 0; r < m; ++r) {
-            const Vec<T> slope = costs.pull[r] - y[2 * m + r] + g.dt * y[m + r];
+            const Vec<T> slope = costs.pull[r] + y[2 * m + r] + g.dt * y[m + r];
             squared_norm += slope * slope;
-            y[2 * m + r] = costs.rate_pull[r];
+            y[2 * m + r] = -costs.rate_pull[r];
         }
         for (int i = 0; i < n; ++i) {
             y[m + 2 * i] += Z[i].x_heading * y[2 * i] + Z[i].y_heading * y[2 * i + 1];

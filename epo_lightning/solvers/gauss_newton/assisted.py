@@ -1,0 +1,185 @@
+"""The compiled backend for energies with features of the user: PyTorch evaluates these, and the kernel takes the steps.
+
+In a Gauss-Newton step, a residual counts by its value and its derivatives at the present iterate alone. For features of
+single time steps (:attr:`~epo_lightning.game.features.Source.STEP`, or a declared control or speed) these are seven numbers
+per agent and time step. The kernel takes them as they are (``given`` in `kernel/game.hpp`), beside its own features. It is
+called once per Gauss-Newton step, because they change with the iterate.
+
+The derivative of a step is that of :mod:`.structured`: with mu, the adjoint of the step, which the kernel returns,
+phi = -<J mu, r + J d> has a part of the kernel's features and one of the user's. PyTorch differentiates the latter.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from epo_lightning.forecast import GameParameters, Solution, Status
+from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.game.features import Source
+from epo_lightning.scene import Scene
+from epo_lightning.solvers.gauss_newton import compiled
+from epo_lightning.solvers.gauss_newton.kernel.interface import GIVEN
+
+_SOURCES = (Source.CONTROL, Source.SPEED, Source.STEP)
+"""Sources of features with one residual per step, which depends on this step alone."""
+
+
+def obstacle(energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> str | None:
+    """Reason why the kernel cannot solve a game with the help of PyTorch; None where it can."""
+    custom, known = energy.custom, energy.built_in
+    if custom is None or known is None:
+        return "an energy needs features that the compiled layer knows, and others"
+    if custom.pair:
+        return f"the compiled layer does not know the pair feature {custom.pair[0]!r}"
+    for name, feature in custom.own_features.items():
+        if feature.source not in _SOURCES:
+            return (
+                f"the compiled layer does not know the feature {name!r}; it takes functions of single steps that are "
+                "declared as such (Source.STEP, docs/extend.md)"
+            )
+    return compiled.obstacle(known, scene, parameters)
+
+
+def solve(
+    energy: FeatureEnergy,
+    scene: Scene,
+    parameters: GameParameters,
+    steps: int,
+    step_size: float,
+    damping: Float[Tensor, "B M *agents"],
+    keep_iterates: bool = False,
+    exact: bool = False,
+) -> Solution:
+    """S damped Gauss-Newton steps; arguments and solution are those of :func:`.structured.solve`.
+
+    Raises:
+        ValueError: steps with the Hessian, which the kernel does not get from PyTorch.
+    """
+    if exact:
+        raise ValueError("steps with the Hessian need features that the kernel knows")
+    assert energy.custom is not None
+    assert energy.built_in is not None
+    game = _Game(energy.custom, energy.built_in, scene, parameters, step_size, damping)
+    controls = torch.where(scene.agent_mask[:, None, :, None, None], parameters.initial_controls, 0.0)
+    status = torch.full(controls.shape[:2], Status.SOLVED)
+    iterates, initial_energy = [controls], None
+    for _ in range(steps):
+        call = game.call(controls, 1)
+        controls = _Step.apply(game, call, controls, *game.weights, *call.inputs)
+        initial_energy = call.initial_energy if initial_energy is None else initial_energy
+        status = torch.maximum(status, call.status)
+        iterates.append(controls)
+    with torch.no_grad():
+        last = game.call(controls, 0)
+        last.run()
+    states = last.states
+    if controls.requires_grad:
+        states = energy.dynamics.rollout(energy.current_states(scene), controls, scene.dt)
+    assert states is not None
+    return Solution(
+        controls=controls,
+        states=states,
+        initial_energy=last.energy if initial_energy is None else initial_energy,
+        energy=last.energy,
+        gradient_norm=last.gradient_norm,
+        status=torch.maximum(status, last.status),
+        iterates=tuple(iterates) if keep_iterates else None,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class _Game:
+    """A game in two parts, the user's features and the kernel's, with the step size and the damping of its steps."""
+
+    custom: FeatureEnergy
+    built_in: FeatureEnergy
+    scene: Scene
+    parameters: GameParameters
+    step_size: float
+    damping: Tensor
+
+    @property
+    def weights(self) -> list[Tensor]:
+        """The weights of the user's features."""
+        return [self.parameters.own_weights[name] for name in self.custom.own]
+
+    def call(self, controls: Float[Tensor, "B M N K 2"], steps: int) -> compiled.Call:
+        """A call of the kernel that takes one step from ``controls``, or none, which evaluates them."""
+        game = dataclasses.replace(self.parameters, initial_controls=controls)
+        return compiled.Call(
+            self.built_in,
+            self.scene,
+            game,
+            steps,
+            self.step_size,
+            self.damping,
+            keep_iterates=False,
+            given=self._given(controls),
+            beside=self.weights,
+        )
+
+    @torch.no_grad()
+    def _given(self, controls: Tensor) -> Float[Tensor, "B M N K R 7"]:
+        """Weighted residuals of the user's features, with their derivatives by states and controls."""
+        custom, scene = self.custom, self.scene
+        around = custom.surroundings(scene, self.parameters)
+        states = custom.dynamics.rollout(custom.current_states(scene), controls, scene.dt)
+        unit = torch.eye(GIVEN - 1, dtype=controls.dtype)[:, None, None, None, None].expand(
+            -1, *controls.shape[:-1], -1
+        )
+        moved = unit[..., :4], unit[..., 4:]
+        rows = []
+        for name in custom.own:
+            value, by = custom.own_residual(name, scene, self.parameters, around, (states, controls), moved)
+            rows.append(torch.cat((value[None], by)).movedim(0, -1))
+        return torch.stack(rows, -2)
+
+    def gradient_of_phi(
+        self, controls: Tensor, weights: list[Tensor], adjoint: Tensor, step: Tensor
+    ) -> tuple[Tensor, list[Tensor]]:
+        """The gradient of the user's part of phi by the controls and by the weights of the user's features."""
+        with torch.enable_grad():
+            controls, leaves = (
+                controls.detach().requires_grad_(),
+                [weight.detach().requires_grad_() for weight in weights],
+            )
+            parameters = dataclasses.replace(
+                self.parameters, own_weights=dict(zip(self.custom.own, leaves, strict=True))
+            )
+            residuals, (along_adjoint, along_step) = self.custom.linearisation(
+                self.scene, parameters, controls, torch.stack((adjoint, step))
+            )
+            phi = -(along_adjoint * (residuals + along_step)).sum()
+            by_controls, *by = torch.autograd.grad(phi, [controls, *leaves], allow_unused=True, materialize_grads=True)
+        return by_controls, list(by)
+
+
+class _Step(torch.autograd.Function):
+    """Autograd function of one step: of the controls, the weights of the user's features and the inputs of the kernel."""
+
+    @staticmethod
+    def forward(ctx: Any, game: _Game, call: compiled.Call, controls: Tensor, *tensors: Tensor) -> Tensor:
+        call.run()
+        ctx.game, ctx.call = game, call
+        # Autograd raises an error if one of the tensors that the backward pass reads was changed in place.
+        ctx.save_for_backward(controls, *tensors, *call.kept, *game.scene.tensors())
+        return call.iterates[-1].clone()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
+        game, call = ctx.game, ctx.call
+        controls, *tensors = ctx.saved_tensors
+        bar, adjoint = cotangent.clone(memory_format=torch.contiguous_format), torch.zeros_like(call.start)
+        gradients = call.differentiate(bar, None, None, adjoint)
+        taken = call.status != Status.STOPPED
+        step = torch.where(taken[..., None, None, None], call.directions[0], 0.0)
+        by_controls, by = game.gradient_of_phi(controls, tensors[: len(game.custom.own)], adjoint, step)
+        bar = bar + torch.where(taken[..., None, None, None], by_controls, 0.0)
+        return None, None, bar, *(torch.where(taken[..., None], one, 0.0) for one in by), *gradients
