@@ -65,6 +65,24 @@ class RandomStates(Callback):
         random.setstate((version, tuple(internal), gauss_next))
 
 
+class NextEpoch(Callback):
+    """Callback that begins a continued run with the epoch after its checkpoint, also if the run ends after some steps.
+
+    The checkpoint is written at the end of an epoch, before Lightning counts the epoch as completed. In a run of a number of
+    epochs, Lightning goes on with the next one. In a run of a number of steps, Lightning enters the same epoch again: it
+    takes a batch more, or counts the epochs wrongly, on which the order of the scenes depends.
+    """
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        loop = trainer.fit_loop
+        if not loop.restarted_on_epoch_end:
+            return
+        progress = loop.epoch_progress
+        progress.total.completed, progress.current.completed = progress.total.processed, progress.current.processed
+        loop.on_iteration_done()  # as after an epoch of an uninterrupted run
+        loop.epoch_loop.restarting = False  # the setter of `loop` itself ignores this value in runs of a number of steps
+
+
 # The two classes below have the names of Lightning's classes, because checkpoints store callback states under these names.
 
 
@@ -218,7 +236,7 @@ def run_callbacks(settings: CallbackSettings, run: RunFolder, title: str) -> lis
     last = ModelCheckpoint(
         run.checkpoints, filename="last", save_on_train_epoch_end=True, every_n_epochs=1, enable_version_counter=False
     )
-    found: list[Callback] = [RandomStates(), Progress(run), best, last]
+    found: list[Callback] = [NextEpoch(), RandomStates(), Progress(run), best, last]
     if settings.patience is not None:
         stopping = EarlyStopping(
             settings.monitor,
@@ -228,7 +246,7 @@ def run_callbacks(settings: CallbackSettings, run: RunFolder, title: str) -> lis
             check_on_train_epoch_end=False,
             check_finite=False,
         )
-        found.insert(2, stopping)
+        found.insert(3, stopping)
     style = style_of(settings)
     if style in ("bar", "lines"):
         found.append(FirstLine(title, run.path))

@@ -93,6 +93,21 @@ def test_a_run_that_had_stopped_early_makes_no_further_step(epo: Epo) -> None:
     assert same("whole", "parts")
 
 
+@pytest.mark.parametrize("between", [2, 3, 5, 8])
+def test_a_run_that_validates_after_a_number_of_steps_goes_on_with_the_next_epoch(epo: Epo, between: int) -> None:
+    """Epochs of four steps: validations are at their ends, or not, or at some of them."""
+    words = ("trainer.max_epochs=null", "trainer.max_steps=18", f"trainer.validate_steps={between}", "trainer.log_every=1")
+    kept = without("trainer.max_epochs")
+    words = (*kept, *words, "trainer.limit_train_batches=4")
+    assert epo(*words, "run_dir=whole") == 0
+    with pytest.MonkeyPatch.context() as patch:
+        stop_before_epoch(3, patch)
+        with pytest.raises(RuntimeError, match="power failure"):
+            epo(*words, "run_dir=parts")
+    assert epo("train", "resume=parts") == 0
+    assert same("whole", "parts")
+
+
 @pytest.mark.parametrize(("during", "words"), [("test_step", ()), ("validation_step", ("budget=untrained",))])
 def test_a_run_that_is_terminated_while_it_is_measured_ends(
     epo: Epo,
