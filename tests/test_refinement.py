@@ -19,6 +19,8 @@ from epo_lightning.metrics.functional import overlap_rate
 from epo_lightning.refinement import ENERGY, SOLVER, WEIGHTS
 from epo_lightning.refinement.game import swerve
 from epo_lightning.registry import ConfigError, build
+from epo_lightning.solvers.backward import Implicit, Unrolled
+from epo_lightning.solvers.gauss_newton.augmented_lagrangian import AugmentedLagrangian
 
 DT, K = 0.2, 20
 APART = {**WEIGHTS, "circles": 0.0}
@@ -242,6 +244,41 @@ def test_gradients_by_weights_margins_and_temperature_are_those_of_finite_differ
             ends.append(value(*moved))
         assert_close(slope, (ends[0] - ends[1]) / 2e-3, rtol=1e-3, atol=1e-5)
         assert slope.abs() > 1e-6
+
+
+@pytest.mark.parametrize(
+    ("solver", "backward"),
+    [
+        (LevenbergMarquardt(steps=2), Unrolled()),
+        (LevenbergMarquardt(steps=20, step_size=1.0, damping=1.0, adaptive=True, newton_steps=30), Implicit()),
+        (AugmentedLagrangian(), Implicit()),
+    ],
+    ids=["two unrolled steps", "a minimum", "hard constraints"],
+)
+def test_gradients_of_probabilities_are_those_of_finite_differences_also_far_from_a_minimum(solver, backward):
+    """Two steps do not reach a minimum, and a minimum under constraints is none of the energy: its slope by the strategies
+    is not zero, so strategies that move with a weight or with a margin change it."""
+    scene, states = crossing(torch.float64)
+    other = states.clone()
+    other[..., 1, :, 1] -= 1.0
+    given, probabilities = torch.cat((states, other), 1), torch.tensor([[0.6, 0.4]], dtype=torch.float64)
+    energy = FeatureEnergy(own=("accref", "turnrref"), pair=("clearance",))
+
+    def value(accref, turnrref, clearance, margin):
+        weights = {"accref": accref, "turnrref": turnrref, "clearance": clearance}
+        options = {"inverse_temperature": 0.05, "solver": solver, "backward": backward}
+        margins = {"clearance": margin}
+        return refine(given, probabilities, scene, energy, weights, margins=margins, **options).probabilities[0, 0]
+
+    numbers = [torch.tensor(number, dtype=torch.float64, requires_grad=True) for number in (1.0, 20.0, 3.0, 0.4)]
+    slopes = torch.autograd.grad(value(*numbers), numbers)
+    for index, slope in enumerate(slopes):
+        ends = []
+        for step in (1e-3, -1e-3):
+            moved = [number.detach() + (step if at == index else 0.0) for at, number in enumerate(numbers)]
+            ends.append(value(*moved))
+        assert_close(slope, (ends[0] - ends[1]) / 2e-3, rtol=1e-3, atol=1e-7)
+    assert all(slopes[index].abs() > 1e-4 for index in (0, 3))
 
 
 def test_no_graph_is_recorded_where_nothing_is_learned():

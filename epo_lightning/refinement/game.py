@@ -76,8 +76,9 @@ def refined(
     solution = backward(solver, energy, scene, parameters)
     least = solution.energy
     if torch.is_grad_enabled() and not least.requires_grad:
-        # At a minimum, the derivative of its energy is the one at constant strategies (envelope theorem).
-        least = energy(scene, parameters, solution.controls.detach())
+        # Only at a minimum of the energy could the strategies be held constant (envelope theorem). A few steps need not reach
+        # one, and under hard constraints the strategies move with the margins.
+        least = energy(scene, parameters, solution.controls)
     logits = log_probabilities - inverse_temperature * (least - least.amin(1, keepdim=True))
     return JointForecast(
         states=solution.states,
