@@ -354,7 +354,10 @@ class EPO(Forecaster):
 
     @torch.no_grad()
     def examine(self, scene: Scene, forecast: JointForecast) -> JointForecast:
-        """The forecast with its distance from an equilibrium, and with the solutions of its games without pair terms."""
+        """The forecast with the solutions of its games without pair terms, and with its distance from an equilibrium, if any.
+
+        Games with hard constraints have no such distance (:func:`.equilibrium.equilibrium`).
+        """
         forecast = dataclasses.replace(forecast, states_without_pairs=self._states_without_pairs(scene, forecast))
         assert forecast.solution is not None
         undeclared = isinstance(self.energy, FeatureEnergy) and self.energy.undeclared is not None

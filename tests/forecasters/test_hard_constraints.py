@@ -13,6 +13,7 @@ from suites import model
 from epo_lightning.forecast import Status
 from epo_lightning.forecasters import build_forecaster
 from epo_lightning.metrics import ForecastMetrics
+from epo_lightning.metrics.forecast import EQUILIBRIUM_METRICS
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +62,18 @@ def test_scores_have_the_share_of_modes_that_violate_their_constraints(forecast_
     metrics.reset()
     metrics.update(soft, scene)
     assert "stopped" not in metrics.compute()
+
+
+def test_forecasts_with_hard_constraints_are_scored_without_a_nash_gap(forecast_and_scene) -> None:
+    forecaster, scene = forecast_and_scene
+    with torch.no_grad():
+        examined = forecaster.examine(scene, forecaster(scene))
+    assert examined.equilibrium is None
+    metrics = ForecastMetrics()
+    metrics.update(examined, scene)
+    scores = metrics.compute()
+    assert "stopped" in scores
+    assert not scores.keys() & set(EQUILIBRIUM_METRICS)
 
 
 def test_tests_warn_with_the_share_of_all_scenes(forecast_and_scene, monkeypatch) -> None:

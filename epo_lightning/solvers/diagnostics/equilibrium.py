@@ -58,17 +58,20 @@ def equilibrium(energy: Energy, scene: Scene, forecast: JointForecast) -> Equili
 
     A scene with NaN or infinite values has no finite report, and does not affect the others.
 
+    Solutions with hard constraints have no report: the weights of their constraints have no effect on the strategies, so the
+    energy of all features with their weights is that of another game.
+
     Args:
         energy: the minimised energy.
         scene: the scene.
         forecast: a forecast with the game (``parameters``) and its ``solution``.
 
     Returns:
-        the report; None if the forecast has no game or no solution, or if the energy offers no gradient and the solution
-        has no tables.
+        the report; None if the forecast has no game or no solution, if the solution has hard constraints, or if the energy
+        offers no gradient and the solution has no tables.
     """
     parameters, solution = forecast.parameters, forecast.solution
-    if parameters is None or solution is None:
+    if parameters is None or solution is None or solution.constraints is not None:
         return None
     mode = forecast.probabilities.argmax(1)
     initial = _of_mode(solution.initial_energy, mode)[:, 0].double()

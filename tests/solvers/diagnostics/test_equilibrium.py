@@ -25,6 +25,7 @@ from epo_lightning.scene import Scene
 from epo_lightning.solvers.diagnostics import quasi_newton
 from epo_lightning.solvers.diagnostics.equilibrium import Descent, equilibrium
 from epo_lightning.solvers.gauss_newton import backends, compiled, structured
+from epo_lightning.solvers.gauss_newton.augmented_lagrangian import AugmentedLagrangian
 from epo_lightning.solvers.gauss_newton.kernel import interface
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
@@ -288,6 +289,19 @@ def test_there_is_no_report_without_a_game_or_a_solution():
     assert equilibrium(energy, scene, dataclasses.replace(forecast, solution=None)) is None
     assert equilibrium(energy, scene, dataclasses.replace(forecast, parameters=None)) is None
     assert equilibrium(Valued(energy), scene, forecast) is None
+
+
+def test_there_is_no_report_of_games_with_hard_constraints():
+    """Their weights have no effect on the strategies, so that the game of soft terms with these weights is another one."""
+    scene = random_scene(2, 2, history=2, size=0.5, dtype=torch.float64)
+    parameters = random_game(scene, 1, STEPS, own=OWN)
+    energy = FeatureEnergy(OWN, pair=("proximity",))
+    solution = AugmentedLagrangian(rounds=3)(energy, scene, parameters)
+    probabilities = torch.ones(2, 1, dtype=torch.float64)
+    forecast = JointForecast(solution.states, probabilities, parameters=parameters, solution=solution)
+    assert equilibrium(energy, scene, forecast) is None
+    soft = dataclasses.replace(forecast, solution=dataclasses.replace(solution, constraints=None))
+    assert equilibrium(energy, scene, soft) is not None
 
 
 def test_scenes_without_agents_have_zero_gaps():
