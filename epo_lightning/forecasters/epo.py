@@ -7,7 +7,6 @@ other methods of its Table 1, and combinations that have not been published, are
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -39,6 +38,7 @@ from epo_lightning.forecasters.epo_settings import (
     check_margin,
     check_modes,
     check_needs,
+    check_pair_start,
     check_start,
 )
 from epo_lightning.forecasters.repeats import repeats_joined, without_repeated_choices
@@ -81,7 +81,7 @@ class EPO(Forecaster):
         own_start: own weights at a network output of zero; the weight is own_start * (1 + network output). One number
             for all features, or numbers by feature name; features that are not named have 1. On highways ``vel``, which
             pulls speeds towards zero, has to start small.
-        pair_start: pair weight at a network output of zero.
+        pair_start: pair weight at a network output of zero; positive where pair weights are.
         symmetric_pairs: whether pair weights are the same in both orders of two agents, so that forecasts do not depend on
             the order of agents.
         initial: ``decoded``, ``zero`` or ``motions``.
@@ -151,8 +151,7 @@ class EPO(Forecaster):
         defined = TABLES in solver.provides or energy.pair_order is not None
         check_probabilities(probabilities)
         check_decodes_probabilities(probabilities, energy, solver)
-        if not math.isfinite(pair_start):
-            raise ConfigError(f"forecaster.pair_start must be finite, not {pair_start}")
+        check_pair_start(pair_start, positive=one_game or pair_weights == "shared")
         check_number("forecaster.control_scale", control_scale)
         super().__init__(task, optimizer)
         self.backbone, self.energy, self.solver, self.modes = backbone, energy, solver.for_modes(modes), modes

@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from epo_lightning.checks import check_choice
+from epo_lightning.checks import check_choice, check_number
 from epo_lightning.forecasters.calibration import Calibration
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.energy import FEATURES, Energy
@@ -218,3 +218,17 @@ def check_start(
         if not 0 < value < math.inf:
             raise ConfigError(f"forecaster.own_start must be positive and finite, but {name} would start at {value}")
     return start
+
+
+def check_pair_start(start: float, positive: bool) -> None:
+    """Refuse an initial pair weight that is not finite, or not positive where weights are start * exp(network output).
+
+    From a start of zero, such weights would stay zero, and agents would never interact.
+
+    Raises:
+        ConfigError: see above.
+    """
+    if positive:
+        check_number("forecaster.pair_start", start)
+    elif not math.isfinite(start):
+        raise ConfigError(f"forecaster.pair_start must be finite, not {start}")

@@ -150,6 +150,11 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
         r"forecaster\.motions must name acceleration .* and curvature .* not acceleration, curvature, jerk$",
     ),
     *(
+        (name, {"pair_start": wrong, **changes}, r"forecaster\.pair_start must be a number, positive, and finite, not")
+        for name, changes in (("rpi_epo", {"one_game": True}), ("rpi_epo", {"pair_weights": "shared"}))
+        for wrong in (0.0, -3.0, float("nan"))
+    ),
+    *(
         ("rpi_epo", {"control_scale": wrong}, "control_scale must be a number, positive")
         for wrong in (0.0, -1.0, float("inf"))
     ),
@@ -162,3 +167,10 @@ def test_invalid_combinations_are_refused(name, wrong, message):
     parts["forecaster"] |= wrong
     with pytest.raises(ConfigError, match=message):
         build_forecaster(model(**parts))
+
+
+@pytest.mark.parametrize("start", [0.0, -3.0])
+def test_pair_weights_to_which_the_output_is_added_may_start_anywhere(start):
+    parts = row("rpi_epo", 2)
+    parts["forecaster"] |= {"pair_start": start}
+    assert build_forecaster(model(**parts)).pair_weights.start == start
