@@ -206,8 +206,11 @@ def check_start(
     Raises:
         ConfigError: an unknown feature, a feature whose weight is fixed, or a weight that is not positive and finite.
     """
-    named, known = start if isinstance(start, Mapping) else {"all": start}, {"all", *features, *OWN_FEATURES}
-    for name, value in named.items():
+    if not isinstance(start, Mapping):
+        check_number("forecaster.own_start", start)
+        return start
+    known = {*features, *OWN_FEATURES}
+    for name, value in start.items():
         if name in all_features and name not in features:
             raise ConfigError(
                 f"forecaster.own_start.{name} has no effect: this energy fixes the weight of {name}; it decodes weights "
@@ -215,8 +218,7 @@ def check_start(
             )
         if name not in known:
             raise ConfigError(f"unknown feature forecaster.own_start.{name}: {nearest(name, known)}")
-        if not 0 < value < math.inf:
-            raise ConfigError(f"forecaster.own_start must be positive and finite, but {name} would start at {value}")
+        check_number(f"forecaster.own_start.{name}", value)
     return start
 
 
