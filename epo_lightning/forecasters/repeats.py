@@ -16,14 +16,17 @@ def without_repeated_choices(logits: Float[Tensor, "B M"], choices: Shaped[Tenso
 
 
 def earliest_same(states: Float[Tensor, "B M N K _"], agent_mask: Bool[Tensor, "B N"]) -> Int[Tensor, "B M"]:
-    """Index of the earliest mode with the same motion (:func:`~epo_lightning.forecast.same_motion`), perhaps its own."""
+    """Index of the earliest mode with the same motion (:func:`~epo_lightning.forecast.same_motion`), perhaps its own.
+
+    Motions in a chain, each the same as the next one, are one outcome, in whatever order the modes are.
+    """
     modes = states.shape[1]
     present = torch.where(agent_mask[:, None, :, None, None], states, 0.0)
     itself = torch.eye(modes, dtype=torch.bool, device=states.device)
-    index = (same_motion(present) | itself).to(torch.uint8).argmax(-1)
-    for _ in range(modes - 2):  # motions in a chain, each the same as the one before, are one outcome
-        index = index.gather(1, index)
-    return index
+    same = same_motion(present) | itself
+    for _ in range((modes - 2).bit_length()):  # boolean matrix products; each doubles the length of the chains
+        same = (same[..., None] & same[:, None]).any(2)
+    return same.to(torch.uint8).argmax(-1)
 
 
 def repeats_joined(

@@ -36,11 +36,25 @@ def everyone(agents: int = 2) -> Tensor:
         ([0.0, 1.5], [0, 1]),
         ([3.0, 0.0, 2.5, 0.1], [0, 1, 0, 1]),
         ([0.0, 0.9, 1.8, 2.7, 3.6], [0, 0, 0, 0, 0]),  # a chain
+        ([0.0, 1.2, 0.6], [0, 0, 0]),  # a chain whose middle is the last mode
         ([0.0, math.nan, math.nan, 0.1], [0, 1, 2, 0]),
     ],
 )
 def test_a_mode_repeats_the_earliest_one_with_the_same_motion(offsets: list[float], earliest: list[int]) -> None:
     assert earliest_same(motions(offsets), everyone()).tolist() == [earliest]
+
+
+@given(st.lists(st.sampled_from([*(0.6 * step for step in range(12)), math.nan]), min_size=1, max_size=9))
+def test_modes_of_a_chain_are_one_outcome_in_any_order(offsets: list[float]) -> None:
+    """A slow version joins the sets of two equal modes until none is left."""
+    outcomes = [{mode} for mode in range(len(offsets))]
+    for one, first in enumerate(offsets):
+        for other, second in enumerate(offsets):
+            if abs(first - second) < 1.0:
+                joined = outcomes[one] | outcomes[other]
+                for mode in joined:
+                    outcomes[mode] = joined
+    assert earliest_same(motions(offsets), everyone()).tolist() == [[min(outcome) for outcome in outcomes]]
 
 
 def test_headings_and_speeds_do_not_make_motions_different() -> None:
