@@ -15,6 +15,7 @@ from epo_lightning.game.features import OWN_FEATURES
 from epo_lightning.objectives.base import Objective
 from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.solvers.base import STATIONARY, TABLES, Minimiser
+from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 from epo_lightning.task import Task
 
 WEIGHTS = ("decoded", "shared")
@@ -52,10 +53,11 @@ def check_horizon(game_horizon: int, energy: Energy, objective: Objective, task:
             f"forecaster.game_horizon must be {task.horizon} or more, the steps of the forecast, not {game_horizon}"
         )
     energy.check_horizon(game_horizon)
-    if game_horizon > task.horizon and not objective.through_solution:
+    learns_from_beginning = objective.through_solution and TABLES not in objective.needs_from_solver
+    if game_horizon > task.horizon and not learns_from_beginning:
         raise ConfigError(
-            "a game that goes on after the forecast (forecaster.game_horizon) needs an objective that learns through "
-            "the solution, objective=imitation: the others compare energies of the observed future, which ends earlier"
+            "a game that goes on after the forecast (forecaster.game_horizon) needs objective=imitation, which learns from "
+            "the beginning of the solution: the others compare whole games with the observed future, which ends earlier"
         )
 
 
@@ -104,8 +106,8 @@ def check_calibration(
     """The configured calibration, if any.
 
     Raises:
-        ConfigError: an unknown key; a solver that does not lead to a minimum; a game with decoded reference controls; or as
-            :class:`~epo_lightning.forecasters.calibration.Calibration`.
+        ConfigError: an unknown key; a solver that does not lead to a minimum, or takes fixed steps, which need not; a game
+            with decoded reference controls; or as :class:`~epo_lightning.forecasters.calibration.Calibration`.
     """
     if calibration is None:
         return None
@@ -114,10 +116,12 @@ def check_calibration(
             "forecaster.calibration poses the game at the first observed state, for which no reference controls are "
             "decoded: leave accref and turnrref out of energy.own, or set calibration to null"
         )
-    if STATIONARY not in solver.provides:
+    fixed = isinstance(solver, LevenbergMarquardt) and not solver.adaptive
+    if STATIONARY not in solver.provides or fixed:
         raise ConfigError(
-            "forecaster.calibration needs a solver that leads to a minimum, such as both_sides, game or converging; set "
-            "it to null for this one"
+            "forecaster.calibration needs a solver that leads to a minimum, such as both_sides, game or converging"
+            + (", or solver.adaptive=true" if fixed else "")
+            + "; set forecaster.calibration to null for this one"
         )
     known = [field.name for field in dataclasses.fields(Calibration)]
     for name in calibration:

@@ -241,6 +241,20 @@ def test_modes_of_both_sides_have_one_game_and_one_start() -> None:
             "forecaster.calibration needs a solver",
         ),
         (
+            {},
+            {"solver": {"name": "levenberg_marquardt", "steps": 2}, "backward": {"name": "unrolled"}},
+            r"forecaster\.calibration needs a solver that leads to a minimum, .* or solver\.adaptive=true",
+        ),
+        (
+            {"calibration": None, "one_game": False},
+            {
+                "solver": {"name": "enumeration", "candidates": 4},
+                "backward": {"name": "unrolled"},
+                "objective": {"name": "conditional", "weights": {"density": 1.0, "marginal": 1.0, "regression": 1.0}},
+            },
+            "objective=imitation",
+        ),
+        (
             {"calibration": None},
             {
                 "objective": {"name": "laplace", "weights": {"density": 1.0, "initial": 1.0, "goal": 1.0}},
