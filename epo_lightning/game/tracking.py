@@ -83,12 +83,20 @@ def observed_controls(
 def with_motion(
     positions: Float[Tensor, "*batch K 2"], current: Float[Tensor, "*batch 4"], dt: float
 ) -> Float[Tensor, "*batch K 4"]:
-    """States from positions, with heading and speed of the motion between steps; a standing agent keeps its heading."""
+    """States from positions, with heading and speed of the motion between steps.
+
+    A standing agent keeps the heading of its last motion, which is that of ``current`` before the first one.
+    """
     before = torch.cat((current[..., None, :2], positions[..., :-1, :]), -2)
     travelled = (positions - before).detach()
     length = travelled.norm(dim=-1)
-    heading = torch.atan2(travelled[..., 1], travelled[..., 0])
-    heading = torch.where(length > 1e-6, heading, current[..., None, HEADING])
+    headings = torch.cat((current[..., None, HEADING], torch.atan2(travelled[..., 1], travelled[..., 0])), -1)
+    steps, reach = length.shape[-1], 1
+    moved = torch.where(length > 1e-6, torch.arange(1, steps + 1, device=length.device), 0)
+    while reach < steps:  # the last step with a motion, among twice as many steps each time; ONNX has no cummax
+        moved = torch.cat((moved[..., :reach], torch.maximum(moved[..., reach:], moved[..., :-reach])), -1)
+        reach *= 2
+    heading = headings.gather(-1, moved)
     return torch.cat((positions, heading[..., None], length[..., None] / dt), -1)
 
 

@@ -7,6 +7,8 @@ import math
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from games import pad, random_scene
 from torch.testing import assert_close
 
@@ -95,6 +97,23 @@ def test_heading_and_speed_of_a_motion_have_no_gradient():
     assert_close(states, torch.tensor(expected, dtype=torch.float64))
     states.sum().backward()
     assert torch.equal(positions.grad, torch.ones_like(positions))
+
+
+@given(st.lists(st.lists(st.sampled_from([(0, 0), (0, 1), (1, 0), (-2, 1)]), min_size=9, max_size=9), min_size=1, max_size=3))
+def test_a_standing_agent_keeps_the_heading_of_its_last_motion(motions: list[list[tuple[int, int]]]):
+    """A slow version goes from step to step."""
+    current = torch.tensor([[1.0, 2.0, 0.7, 3.0]] * len(motions), dtype=torch.float64)
+    positions = current[:, None, :2] + torch.tensor(motions, dtype=torch.float64).cumsum(1)
+    expected = []
+    for steps in motions:
+        heading = 0.7
+        expected.append([])
+        for x, y in steps:
+            heading = math.atan2(y, x) if (x, y) != (0, 0) else heading
+            expected[-1].append([heading, math.hypot(x, y) / 0.5])
+    states = with_motion(positions, current, 0.5)
+    assert torch.equal(states[..., :2], positions)
+    assert_close(states[..., 2:], torch.tensor(expected, dtype=torch.float64))
 
 
 def test_noise_does_not_become_wild_controls():
