@@ -118,7 +118,7 @@ class Softness(NamedTuple):
 
 @dataclass(frozen=True)
 class ImitationSchedule:
-    """How an imitation loss changes during training.
+    """Schedule of an imitation loss: how it changes during training.
 
     Attributes:
         power: exponent of :func:`distances`.

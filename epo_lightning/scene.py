@@ -168,9 +168,9 @@ class Scene(Batch):
         """Refuse values that no forecaster can use. On a GPU, this check makes the host wait for the tensors.
 
         Raises:
-            ValueError: a present agent that is not observed at t0, a heading without digits for a direction, a length or
-                width that is not positive and finite, a kind that does not exist, or the index of a reference line that does
-                not exist.
+            ValueError: a present agent that is not observed at t0, a heading so large that rounding hides its direction, a
+                length or width that is not positive and finite, a kind that does not exist, or the index of a reference
+                line that does not exist.
         """
         assert self.history_mask is not None
         bad = self.agent_mask & ~self.history_mask[..., -1]

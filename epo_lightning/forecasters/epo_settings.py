@@ -19,7 +19,7 @@ from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarq
 from epo_lightning.task import Task
 
 WEIGHTS = ("decoded", "shared")
-"""Sources of the weights of own features: decoded for each agent, or one learned number per feature for all."""
+"""Sources of the weights of features: decoded for each agent or pair, or one learned number per feature for all of them."""
 INITIAL = ("decoded", "zero", "motions")
 """Sources of the initial strategies: decoded by the network, controls of zero (the paper's ablation "no init"), or a mixture
 of motions of the unicycle. For solvers that choose among candidates, these strategies are the candidates."""

@@ -78,7 +78,7 @@ class ToFeedback(Minimiser):
     ) -> tuple[Tensor, Tensor]:
         """Controls with the derivative of the fixed point, which is zero where the game is not solved, and the status.
 
-        Warns, once per process, if more than half of the games are not solved.
+        Warns if more than half of the games are not solved.
 
         Raises:
             ConfigError: ``exact`` is false. Gauss-Newton costs are part of the fixed point, and cannot be left out.
