@@ -46,7 +46,7 @@ from epo_lightning.game.energy import FEATURES, RESIDUALS, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.objectives.base import Objective, Terms
 from epo_lightning.optimizers import Adam
-from epo_lightning.registry import ConfigError, build, register
+from epo_lightning.registry import build, register
 from epo_lightning.scene import Scene
 from epo_lightning.solvers.backward import Backward
 from epo_lightning.solvers.base import SAMPLES, TABLES, Minimiser
@@ -353,7 +353,7 @@ class EPO(Forecaster):
 
     @torch.no_grad()
     def examine(self, scene: Scene, forecast: JointForecast) -> JointForecast:
-        """The forecast with the solutions of its games without pair terms, and with its distance from an equilibrium, if any.
+        """The forecast with its distance from an equilibrium, and with the solutions of its games without pair terms.
 
         Games with hard constraints have no such distance (:func:`.equilibrium.equilibrium`).
         """

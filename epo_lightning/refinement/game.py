@@ -76,7 +76,7 @@ def refined(
     solution = backward(solver, energy, scene, parameters)
     least = solution.energy
     if torch.is_grad_enabled() and not least.requires_grad:
-        # Only at a minimum of the energy could the strategies be held constant (envelope theorem). A few steps need not reach
+        # Strategies could be held constant at a minimum of the energy only (envelope theorem). A few steps need not reach
         # one, and under hard constraints the strategies move with the margins.
         least = energy(scene, parameters, solution.controls)
     logits = log_probabilities - inverse_temperature * (least - least.amin(1, keepdim=True))

@@ -143,8 +143,14 @@ def test_agents_without_a_future_have_no_gradient():
         ({"forecaster": {**EPO, "initial": "zeros"}}, "unknown forecaster.initial 'zeros': did you mean 'zero'"),
         ({"forecaster": {**EPO, "own_start": {"val": 1.0}}}, "own_start.val: did you mean 'vel'"),
         ({"forecaster": {**EPO, "own_start": {"all": 0.1}}}, r"unknown feature forecaster\.own_start\.all"),
-        ({"forecaster": {**EPO, "own_start": {"vel": 0.0}}}, r"own_start\.vel must be a number, positive, .* not 0\.0$"),
-        ({"forecaster": {**EPO, "own_start": -1.0}}, r"^forecaster\.own_start must be a number, positive, .* not -1\.0$"),
+        (
+            {"forecaster": {**EPO, "own_start": {"vel": 0.0}}},
+            r"own_start\.vel must be a number, positive, .* not 0\.0$",
+        ),
+        (
+            {"forecaster": {**EPO, "own_start": -1.0}},
+            r"^forecaster\.own_start must be a number, positive, .* not -1\.0$",
+        ),
         ({"objective": {"name": "imitation", "weights": LOSS_WEIGHTS}}, "weights must name"),
     ],
 )

@@ -7,9 +7,9 @@ import math
 
 import pytest
 import torch
+from games import pad, random_scene
 from hypothesis import given
 from hypothesis import strategies as st
-from games import pad, random_scene
 from torch.testing import assert_close
 
 from epo_lightning.game.double_integrator import DoubleIntegrator
@@ -99,7 +99,11 @@ def test_heading_and_speed_of_a_motion_have_no_gradient():
     assert torch.equal(positions.grad, torch.ones_like(positions))
 
 
-@given(st.lists(st.lists(st.sampled_from([(0, 0), (0, 1), (1, 0), (-2, 1)]), min_size=9, max_size=9), min_size=1, max_size=3))
+@given(
+    st.lists(
+        st.lists(st.sampled_from([(0, 0), (0, 1), (1, 0), (-2, 1)]), min_size=9, max_size=9), min_size=1, max_size=3
+    )
+)
 def test_a_standing_agent_keeps_the_heading_of_its_last_motion(motions: list[list[tuple[int, int]]]):
     """A slow version goes from step to step."""
     current = torch.tensor([[1.0, 2.0, 0.7, 3.0]] * len(motions), dtype=torch.float64)

@@ -31,6 +31,16 @@ ROUNDING = 1e-6
 """Difference of arc lengths [m] that rounding explains, kilometres from the origin."""
 
 
+def without_repetitions(line: Polyline) -> Polyline:
+    """The line without points that are equal to the one before them.
+
+    Example:
+        >>> without_repetitions(np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 0.0]])).tolist()
+        [[0.0, 0.0], [1.0, 0.0]]
+    """
+    return line[np.append(True, (np.diff(line, axis=0) != 0).any(1))]
+
+
 class Polylines:
     """Many polylines with vectorised queries: projection of positions, and points at given arc lengths.
 
@@ -39,7 +49,7 @@ class Polylines:
     """
 
     def __init__(self, lines: Sequence[Polyline]) -> None:
-        kept = [line[np.append(True, (np.diff(line, axis=0) != 0).any(1))] for line in lines]
+        kept = [without_repetitions(line) for line in lines]
         count = np.array([len(line) for line in kept], dtype=int)
         self.first = np.concatenate([[0], count.cumsum()])
         self.points = np.concatenate([np.empty((0, 2)), *kept])

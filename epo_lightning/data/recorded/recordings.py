@@ -121,17 +121,17 @@ class RecordedData(SceneDataModule):
         self.num_agents, self.history = self.windows.agents, self.windows.history
         if self.windows.lane_change and not map:
             raise ConfigError("data.windows.lane_change asks for lanes, but data.map is false: set it to false as well")
-        for name, share in (("test_share", test_share), ("val_share", val_share)):
-            if not 0 < share < 1:
-                raise ConfigError(f"data.{name} must be a share between 0 and 1, not {share}")
-        for name, value, known in (
+        for name, value in (("test_share", test_share), ("val_share", val_share)):
+            if not 0 < value < 1:
+                raise ConfigError(f"data.{name} must be a share between 0 and 1, not {value}")
+        for name, choice, known in (
             ("frame", frame, FRAMES),
             ("val_by", val_by, UNITS),
             ("shape", shape, SHAPES),
             ("duplicates", duplicates, DUPLICATES),
         ):
-            if value not in known:
-                raise ConfigError(f"unknown data.{name} {value!r}: {nearest(str(value), known)}")
+            if choice not in known:
+                raise ConfigError(f"unknown data.{name} {choice!r}: {nearest(str(choice), known)}")
         groups = None if test is None else tuple(str(group) for group in test)
         self.rule = SplitRule(groups, test_share, val_share, val_by, seed)
         self.duplicates = duplicates

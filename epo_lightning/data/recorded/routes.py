@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from epo_lightning.data.recorded.lanes import SHOULDER, LaneGraph, Located, Polyline, Polylines
+from epo_lightning.data.recorded.lanes import SHOULDER, LaneGraph, Located, Polyline, Polylines, without_repetitions
 
 LINES = 3
 """Reference lines R per agent: left, own, right."""
@@ -130,7 +130,7 @@ def straightest(following: Sequence[tuple[int, ...]], lanes: LaneGraph, forwards
 
 def direction(line: Polyline, at_end: bool) -> Float[np.ndarray, " 2"]:
     """Unit vector of a line's direction at its beginning or end."""
-    points = line[np.append(True, (np.diff(line, axis=0) != 0).any(1))]
+    points = without_repetitions(line)
     way = points[-1] - points[-2] if at_end else points[1] - points[0]
     return way / np.linalg.norm(way)
 

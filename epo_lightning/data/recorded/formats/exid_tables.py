@@ -8,9 +8,7 @@ from pathlib import Path
 import polars as pl
 
 from epo_lightning.data.recorded.formats import tables
-from epo_lightning.data.recorded.formats.tables import FLAG, FLOAT, FLOATS, INT, INTS, TEXT, Types, raise_first
-
-__all__ = ["raise_first", "read_recording_meta", "read_table", "read_tracks", "read_tracks_meta"]
+from epo_lightning.data.recorded.formats.tables import FLAG, FLOAT, FLOATS, INT, INTS, TEXT, Types
 
 TRACKS: Types = (
     dict.fromkeys(("recordingId", "trackId", "frame", "trackLifetime"), INT)

@@ -21,7 +21,7 @@ from pyproj import Transformer
 from epo_lightning.data.errors import RecordingError
 from epo_lightning.data.recorded.formats import xml
 from epo_lightning.data.recorded.formats.centreline import centreline
-from epo_lightning.data.recorded.lanes import FARTHEST, LANE, SHOULDER, LaneGraph, Polyline
+from epo_lightning.data.recorded.lanes import FARTHEST, LANE, SHOULDER, LaneGraph, Polyline, without_repetitions
 
 EMERGENCY_LANE = "emergency_lane"
 FOR_VEHICLES = frozenset({"", "road", "highway", "play_street", "bus_lane", "exit", EMERGENCY_LANE})
@@ -217,12 +217,8 @@ def _ways(root: Element, positions: dict[int, Float[np.ndarray, " 2"]], path: Pa
         nodes = tuple(xml.whole(node.get("ref"), f"a node of way {id}", path) for node in element.iterfind("nd"))
         if nodes and all(node in positions for node in nodes):
             points = np.array([positions[node] for node in nodes])
-            ways[id] = _Way(id, nodes, _without_repetitions(points), _tags(element))
+            ways[id] = _Way(id, nodes, without_repetitions(points), _tags(element))
     return ways
-
-
-def _without_repetitions(line: Polyline) -> Polyline:
-    return line[np.append(True, (np.diff(line, axis=0) != 0).any(1))]
 
 
 def _for_vehicles(tags: Tags) -> bool:
@@ -255,7 +251,7 @@ def _lanelet(id: int, relation: Element, tags: Tags, ways: dict[int, _Way], path
         centre = drawn[0].points
     else:
         touching = left_bound.ends[0] == right_bound.ends[0]
-        centre = _without_repetitions(centreline(left_bound.line, right_bound.line, touching))
+        centre = without_repetitions(centreline(left_bound.line, right_bound.line, touching))
     if len(centre) < 2:
         return "lanelets without length or width"
     kind = SHOULDER if tags.get("subtype") == EMERGENCY_LANE else LANE

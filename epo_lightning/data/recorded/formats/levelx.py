@@ -30,13 +30,12 @@ from epo_lightning.data.recorded.formats.exid_tables import (
     TRACKS,
     TRACKS_META,
     USED,
-    raise_first,
     read_table,
 )
 from epo_lightning.data.recorded.formats.highd_lanes import highd_lanes
 from epo_lightning.data.recorded.formats.levelx_dialects import DIALECTS, LANELET2, MARKINGS, Dialect
 from epo_lightning.data.recorded.formats.motion import check_motion, unwrapped
-from epo_lightning.data.recorded.formats.tables import FLOATS, INT, Types
+from epo_lightning.data.recorded.formats.tables import FLOATS, INT, Types, raise_first
 from epo_lightning.data.recorded.kinds import completed_sizes, kinds_of
 from epo_lightning.data.recorded.lanes import LaneGraph
 from epo_lightning.data.recorded.tracks import FASTEST, Recording, RecordingSource, TrackTable
