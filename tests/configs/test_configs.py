@@ -411,6 +411,14 @@ def test_other_folders_beside_the_tree_are_not_groups() -> None:
             r"sweeps/mine\.yaml has an unknown key 'parms' under hydra: a sweep's values stand in hydra\.sweeper\.params",
         ),
         (
+            "sweeps/mine.yaml",
+            "hydra: {sweeper: {params: {seed: '0,1'}}}",
+            "sweeps=mine",
+            r"sweeps/mine\.yaml must begin with the line `# @package _global_`, as every file in sweeps/ does",
+        ),
+        ("sweeps/mine.yaml", "", "sweeps=mine", r"sweeps/mine\.yaml must begin with the line `# @package _global_`"),
+        ("budget/mine.yaml", "budget: {name: mine}", "budget=mine", r"budget/mine\.yaml must begin with the line `# @pack"),
+        (
             "backbone/mine.yaml",
             "name: v_lstm\n  width: 3",
             "backbone=mine",

@@ -15,7 +15,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from epo_lightning.experiment.config.messages import one_sentence, sentence, without_header
+from epo_lightning.experiment.config.messages import one_sentence, sentence
 from epo_lightning.experiment.config.sources import options_of, recorded_name
 from epo_lightning.identity import canonical, essence, of_row
 from epo_lightning.registry import ConfigError, parts
@@ -105,9 +105,6 @@ def resolve(config: DictConfig) -> dict[str, Any]:
     if "trainer" in values and "hydra" in config:
         _refuse_ignored(values, config.hydra.overrides.task)
     if choices.get("experiment"):
-        instance = GlobalHydra.instance().hydra
-        if isinstance(values.get("experiment"), Mapping) and instance is not None:  # its settings under its own name
-            raise ConfigError(without_header(instance, choices["experiment"]))
         choices["experiment"] = recorded_name(choices["experiment"], choices.get("data", ""))
         values["experiment"] = choices["experiment"]
     if "trainer" in values:

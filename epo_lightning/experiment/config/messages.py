@@ -44,8 +44,6 @@ def one_sentence(instance: Hydra, name: str, overrides: Sequence[str]) -> Iterat
         repeated = re.search(r"Multiple values for ([\w./@]+)\. .*'override [\w./@]+: (\S+)'", str(error))
         if repeated:
             raise ConfigError(_override(instance, repeated.group(1), repeated.group(2), overrides)) from error
-        if re.search(r"'\w+@experiment\.", str(error)):
-            raise ConfigError(without_header(instance, _chosen(overrides))) from error
         unknown = re.search(r"Could not (?:override|delete from config\.) +'([\w./@]+)'", str(error))
         if unknown and (relative := re.fullmatch(r"experiment/(?:[\w-]+/)*([\w-]+)@[\w.-]+", unknown.group(1))):
             raise ConfigError(_override(instance, relative.group(1), "<option>", overrides)) from error
@@ -67,14 +65,6 @@ def _in_file(message: str) -> str:
         return ""
     file, key = found.groups()
     return f"{file}.yaml has an unknown key {key!r} under hydra: a sweep's values stand in hydra.sweeper.params"
-
-
-def without_header(instance: Hydra, experiment: str) -> str:
-    """The error message for an experiment's file whose settings are not those of the whole configuration."""
-    return (
-        f"{file_of(instance, experiment)} must begin with the line `# @package _global_`, as every experiment does (in "
-        "UTF-8 without a byte order mark)"
-    )
 
 
 def _chosen(overrides: Sequence[str]) -> str:

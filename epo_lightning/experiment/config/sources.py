@@ -21,6 +21,8 @@ GROUP = "sweeps"
 HIGHWAYS = ("exid", "us101", "highway_sim", "highd", "ind", "round", "unid", "interaction", "argoverse2", "waymo")
 """Data sets with lanes, each of which has all rows of ``experiment/highway/`` under its own name."""
 EXPERIMENTS = "experiment"
+GLOBAL = (EXPERIMENTS, GROUP, "budget", "task", "debug")
+"""Groups whose files set keys of the whole configuration, not those of a section that is named after the group."""
 
 _PARSED: dict[tuple[str, str, str, int], bytes] = {}
 """Parsed files, pickled, by provider, folder, name and time of the last change."""
@@ -39,6 +41,11 @@ class ParsedOnce(FileConfigSource):
                 loaded = super().load_config(config_path)
             except (YAMLError, UnicodeDecodeError) as error:
                 raise ConfigError(_where(file, error)) from error
+            if config_path.partition("/")[0] in GLOBAL and loaded.header.get("package") != "_global_":
+                raise ConfigError(
+                    f"{file} must begin with the line `# @package _global_`, as every file in {config_path.partition('/')[0]}/ "
+                    "does (in UTF-8 without a byte order mark)"
+                )
             _PARSED[key] = pickle.dumps(loaded)
         # Hydra changes what it is given, so that every composition gets a copy.
         result: ConfigResult = pickle.loads(_PARSED[key])
