@@ -435,6 +435,40 @@ def test_mistakes_in_files_of_the_tree_are_named(
         compose("train", [words], [str(tmp_path)])
 
 
+@pytest.mark.parametrize(
+    ("params", "message"),
+    [
+        (
+            "experiment: [rpi/v_lstm_sc, rpi/v_lstm_epo]",
+            r"params: experiment=\['rpi/v_lstm_sc', 'rpi/v_lstm_epo'\] is a list.* write rpi/v_lstm_sc,rpi/v_lstm_epo without",
+        ),
+        ("seed: 0;1", r"params: cannot read `seed: 0;1`, expected a value, or several with commas .*: `seed: a,b`"),
+        (
+            "optimizer: {lr: '1e-3,1e-4'}",
+            r"params: optimizer is a section, expected dotted keys .*: write `optimizer\.lr: 1e-3,1e-4`",
+        ),
+        ("energy: 0;1", r"params: cannot read `energy: 0;1`"),
+    ],
+)
+def test_mistakes_in_the_values_of_a_sweep_are_named(
+    tmp_path: Path, refused: Callable[..., str], params: str, message: str
+) -> None:
+    file = tmp_path / "conf" / "sweeps" / "mine.yaml"
+    file.parent.mkdir(parents=True)
+    file.write_text(f"# @package _global_\nhydra:\n  sweeper:\n    params:\n      {params}\n")
+    said = refused("sweep", "mine", f"--config-dir={tmp_path / 'conf'}", "data=tiny", "budget=smoke")
+    assert re.search(rf"/sweeps/mine\.yaml, hydra\.sweeper\.{message}", said)
+
+
+def test_a_list_of_options_is_no_mixture_of_them(refused: Callable[..., str]) -> None:
+    several = "experiment=[rpi/v_lstm_sc,rpi/v_lstm_epo]"
+    for words in (("train",), ("config", "check"), ("train", "-m"), ("sweep", "rpi_main")):
+        said = refused(*words, several, "data=tiny", "budget=smoke")
+        assert "write rpi/v_lstm_sc,rpi/v_lstm_epo without brackets" in said
+    assert "without brackets" in refused("evaluate", "run=x", "data=[tiny,drawn]")
+    compose("train", ["experiment=rpi/v_lstm_sc", "logger=[csv,tensorboard]"])
+
+
 @pytest.mark.parametrize("base", ["rpi/v_lstm_sc_relaxed", "us101/vibes_epo"])
 def test_rows_of_own_can_be_based_on_any_row(base: str, tmp_path: Path) -> None:
     """Rows name their bases from the root of the tree: a relative name would be looked up beside the row of one's own."""

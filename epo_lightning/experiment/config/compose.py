@@ -15,8 +15,8 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from epo_lightning.experiment.config.messages import one_sentence, sentence
-from epo_lightning.experiment.config.sources import options_of, recorded_name
+from epo_lightning.experiment.config.messages import one_sentence, refuse_merged, sentence
+from epo_lightning.experiment.config.sources import GROUP, file_of, options_of, recorded_name
 from epo_lightning.identity import canonical, essence, of_row
 from epo_lightning.registry import ConfigError, parts
 
@@ -211,7 +211,7 @@ def jobs(name: str, overrides: Sequence[str], extra: Sequence[str] = ()) -> list
         sweeper = config.hydra.sweeper
         if not str(sweeper.get("_target_", "")).endswith("BasicSweeper"):
             return []
-        params = [f"{key}={value}" for key, value in (sweeper.params or {}).items()]
+        params = _params(instance, config)
         # Not resolved here: run_dir=one-${seed} must be resolved in each job, with the job's own seed.
         task = OmegaConf.to_container(config.hydra.overrides.task, resolve=False)
         assert isinstance(task, list)
@@ -232,10 +232,42 @@ def fixed_choices(name: str, sweep: str, extra: Sequence[str] = ()) -> dict[str,
     from hydra.core.override_parser.overrides_parser import OverridesParser
 
     with hydra(extra) as instance:
-        params = _composed(instance, name, [f"sweeps={sweep}"], multirun=True).hydra.sweeper.get("params") or {}
-        words = [f"{group}={option}" for group, option in params.items() if options_of(instance, str(group))]
+        params = _params(instance, _composed(instance, name, [f"sweeps={sweep}"], multirun=True))
+        words = [word for word in params if options_of(instance, word.partition("=")[0])]
         parsed = OverridesParser.create(config_loader=instance.config_loader).parse_overrides(words)
         return {one.key_or_group: str(one.input_line) for one in parsed if not one.is_sweep_override()}
+
+
+def _params(instance: Hydra, config: DictConfig) -> list[str]:
+    """The values that a sweep's file lists in ``hydra.sweeper.params``, as overrides.
+
+    Raises:
+        ConfigError: settings of a section that are not written as dotted keys, or a value that cannot be read.
+    """
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+    from omegaconf import DictConfig
+
+    parser = OverridesParser.create(config_loader=instance.config_loader)
+    file = f"{file_of(instance, GROUP, str(config.hydra.runtime.choices.get(GROUP)))}, hydra.sweeper.params"
+    words = []
+    for key, value in (config.hydra.sweeper.get("params") or {}).items():
+        if isinstance(value, DictConfig):
+            inner, first = next(iter(value.items()), ("<key>", "<values>"))
+            raise ConfigError(
+                f"{file}: {key} is a section, expected dotted keys with their values: write `{key}.{inner}: {first}`"
+            )
+        word = f"{key}={value}"
+        try:
+            parser.parse_override(word)
+        except HydraException as error:
+            raise ConfigError(
+                f"{file}: cannot read `{key}: {value}`, expected a value, or several with commas between them: `{key}: a,b`; "
+                "a value with other than plain letters, digits and ._-/ needs quotes of its own, \"'value'\""
+            ) from error
+        refuse_merged(instance, word, f"{file}: ")
+        words.append(word)
+    return words
 
 
 def trials(name: str, overrides: Sequence[str], extra: Sequence[str] = ()) -> int | None:
@@ -291,6 +323,7 @@ def _composed(instance: Hydra, name: str, overrides: Sequence[str], multirun: bo
                 f"{word}: environment variables are not resolved in overrides, because run folders would keep their values; "
                 'let the shell replace them, key="$NAME", or write the interpolation into a file of the configuration tree'
             )
+        refuse_merged(instance, word)
     with one_sentence(instance, name, overrides):
         return instance.compose_config(
             config_name=name,

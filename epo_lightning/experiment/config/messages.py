@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from epo_lightning.experiment.config.sources import file_of, options_of
+from epo_lightning.experiment.config.sources import EXPERIMENTS, file_of, options_of
 from epo_lightning.registry import ConfigError, nearest, parts
 
 if TYPE_CHECKING:
@@ -23,6 +23,9 @@ PLUGINS = {
     "hydra/sweeper/optuna": "search",
 }
 """Options that come with another package, and the extra that installs it."""
+
+SEVERAL = "logger"
+"""The only group of which a run can have several options."""
 
 
 @contextmanager
@@ -56,6 +59,27 @@ def one_sentence(instance: Hydra, name: str, overrides: Sequence[str]) -> Iterat
         raise ConfigError(sentence(error)) from error
 
 
+def refuse_merged(instance: Hydra, word: str, where: str = "") -> None:
+    """Refuse an override that chooses a list of options of a group, which Hydra would merge into one configuration.
+
+    Args:
+        instance: Hydra with the configuration tree.
+        word: the override.
+        where: beginning of the message: the file that has it, if it is not from the command line.
+
+    Raises:
+        ConfigError: a list of options; the message says how to write one run of each.
+    """
+    group, _, value = word.lstrip("+").partition("=")
+    if not value.strip().startswith("[") or group == SEVERAL or not options_of(instance, group):
+        return
+    options = ",".join(re.findall(r"[^\s,'\"\[\]]+", value))
+    raise ConfigError(
+        f"{where}{word} is a list, which would be merged into a single run: for a run of each, write {options} without "
+        "brackets, in a sweep or with the option -m"
+    )
+
+
 def _in_file(message: str) -> str:
     """The error message for a key that Hydra's own sections do not have, in the file that has it; empty for other errors."""
     found = re.search(
@@ -78,7 +102,7 @@ def _override(instance: Hydra, group: str, option: str, overrides: Sequence[str]
     if any(word.startswith(f"+{group}=") for word in overrides):
         return f"+{group}={option}: {group} has an option already, so leave out the plus: {group}={option}"
     return (
-        f"{group} has an option already: in the defaults list of {file_of(instance, _chosen(overrides))}, or of a file that "
+        f"{group} has an option already: in the defaults list of {file_of(instance, EXPERIMENTS, _chosen(overrides))}, or of a file that "
         f"it is based on, write `- override /{group}: {option}`, with the slash"
     )
 

@@ -185,12 +185,12 @@ def _ours(config_path: str) -> bool:
     return config_path == GROUP or config_path.startswith(f"{GROUP}/")
 
 
-def file_of(instance: Hydra, option: str) -> str:
-    """Path of the file of an experiment, in the first folder of the search path that has it; its usual place if none has."""
+def file_of(instance: Hydra, group: str, option: str) -> str:
+    """Path of the file of an option, in the first folder of the search path that has it; its usual place if none has."""
     for source in instance.config_loader.get_sources():
-        if (file := Path(source.path) / EXPERIMENTS / f"{option}.yaml").is_file():
+        if (file := Path(source.path) / group / f"{option}.yaml").is_file():
             return str(file)
-    return f"conf/{EXPERIMENTS}/{option}.yaml"
+    return f"{'' if group == GROUP else 'conf/'}{group}/{option}.yaml"
 
 
 def options_of(instance: Hydra, group: str) -> list[str]:
