@@ -129,7 +129,7 @@ def of_row(config: Mapping[str, Any]) -> dict[str, Any]:
 
 def differences(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
     """Key, value and other value of everything in which the essences of two configurations differ."""
-    left, right = dict(_leaves(essence(one))), dict(_leaves(essence(other)))
+    left, right = dict(leaves(essence(one))), dict(leaves(essence(other)))
     pairs = [(key, left.get(key), right.get(key)) for key in sorted({*left, *right})]
     return [(key, a, b) for key, a, b in pairs if canonical(a) != canonical(b)]
 
@@ -142,9 +142,10 @@ def canonical(content: Any) -> str:
     return json.dumps(content, sort_keys=True, default=str)
 
 
-def _leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted keys of nested sections, with their values; an empty section is a value."""
     for key, value in values.items():
         if isinstance(value, Mapping) and value:
-            yield from _leaves(value, f"{prefix}{key}.")
+            yield from leaves(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", value

@@ -417,7 +417,12 @@ def test_other_folders_beside_the_tree_are_not_groups() -> None:
             r"sweeps/mine\.yaml must begin with the line `# @package _global_`, as every file in sweeps/ does",
         ),
         ("sweeps/mine.yaml", "", "sweeps=mine", r"sweeps/mine\.yaml must begin with the line `# @package _global_`"),
-        ("budget/mine.yaml", "budget: {name: mine}", "budget=mine", r"budget/mine\.yaml must begin with the line `# @pack"),
+        (
+            "budget/mine.yaml",
+            "budget: {name: mine}",
+            "budget=mine",
+            r"budget/mine\.yaml must begin with the line `# @pack",
+        ),
         (
             "backbone/mine.yaml",
             "name: v_lstm\n  width: 3",
@@ -440,7 +445,7 @@ def test_mistakes_in_files_of_the_tree_are_named(
     [
         (
             "experiment: [rpi/v_lstm_sc, rpi/v_lstm_epo]",
-            r"params: experiment=\['rpi/v_lstm_sc', 'rpi/v_lstm_epo'\] is a list.* write rpi/v_lstm_sc,rpi/v_lstm_epo without",
+            r"params: experiment=\['rpi/v_lstm_sc', 'rpi/v_lstm_epo'\] is a list.* write rpi/v_lstm_sc,rpi/v_lstm_epo with",
         ),
         ("seed: 0;1", r"params: cannot read `seed: 0;1`, expected a value, or several with commas .*: `seed: a,b`"),
         (
@@ -451,7 +456,10 @@ def test_mistakes_in_files_of_the_tree_are_named(
     ],
 )
 def test_mistakes_in_the_values_of_a_sweep_are_named(
-    tmp_path: Path, refused: Callable[..., str], params: str, message: str
+    tmp_path: Path,
+    refused: Callable[..., str],  # noqa: F811
+    params: str,
+    message: str,
 ) -> None:
     file = tmp_path / "conf" / "sweeps" / "mine.yaml"
     file.parent.mkdir(parents=True)
@@ -460,7 +468,7 @@ def test_mistakes_in_the_values_of_a_sweep_are_named(
     assert re.search(rf"/sweeps/mine\.yaml, hydra\.sweeper\.{message}", said)
 
 
-def test_a_list_of_options_is_no_mixture_of_them(refused: Callable[..., str]) -> None:
+def test_a_list_of_options_is_no_mixture_of_them(refused: Callable[..., str]) -> None:  # noqa: F811
     several = "experiment=[rpi/v_lstm_sc,rpi/v_lstm_epo]"
     for words in (("train",), ("config", "check"), ("train", "-m"), ("sweep", "rpi_main")):
         said = refused(*words, several, "data=tiny", "budget=smoke")
@@ -481,6 +489,40 @@ def test_rows_of_own_can_be_based_on_any_row(base: str, tmp_path: Path) -> None:
     config = compose("train", ["experiment=rpi/mine"], [str(tmp_path)])
     assert config["title"] == "mine"
     assert row_identity({**config, "title": ""}, "") == row_identity({**of_experiment(base), "title": ""}, "")
+
+
+def test_settings_of_a_row_of_own_that_the_budget_replaces_are_refused(
+    tmp_path: Path,
+    refused: Callable[..., str],  # noqa: F811
+) -> None:
+    conf = tmp_path / "conf"
+    params = "{experiment: rpi/mine, optimizer.lr: '1e-3,1e-4'}"
+    own = "optimizer: {lr: 3.0e-4, clip: 1}\ndata: {batch_size: 8}"
+    for folder, text in {
+        "experiment/rpi/mine": f"defaults: [/experiment/rpi/v_lstm, _self_]\n{own}",
+        "experiment/rpi/other": "defaults: [/experiment/rpi/mine, _self_]\ntitle: other",
+        "budget/mine": "budget: {name: mine}\noptimizer: {lr: 3.0e-4}",
+        "sweeps/mine": f"hydra: {{sweeper: {{params: {params}}}}}\ndata: {{batch_size: 8}}",
+    }.items():
+        (conf / folder).parent.mkdir(parents=True, exist_ok=True)
+        (conf / f"{folder}.yaml").write_text(f"# @package _global_\n{text}\n")
+    said = (
+        r"/experiment/rpi/mine\.yaml sets optimizer\.lr: 0\.0003, data\.batch_size: 8 without effect: the budget's file "
+        r".*conf/budget/smoke\.yaml is read later and sets optimizer\.lr: 0\.001, data\.batch_size: 16; move such settings "
+        r"to the command line \(optimizer\.lr=0\.0003 data\.batch_size=8\), to the file of a sweep, or to a budget"
+    )
+    words = (f"--config-dir={conf}", "data=tiny")
+    for row in ("mine", "other"):
+        for verb in (("train",), ("config", "check"), ("sweep", "rpi_main")):
+            assert re.search(said, refused(*verb, *words, f"experiment=rpi/{row}", "budget=smoke"))
+
+    def learning_rate(*words: str) -> float:
+        return compose("train", ["experiment=rpi/other", *words], [str(conf)])["optimizer"]["lr"]
+
+    assert learning_rate("budget=mine") == 3e-4
+    assert learning_rate("budget=smoke", "optimizer.lr=1e-3", "data.batch_size=16") == 1e-3
+    listed = jobs("train", ["sweeps=mine", "budget=smoke"], [str(conf)])
+    assert [compose("train", job, [str(conf)])["optimizer"]["lr"] for job in listed] == [1e-3, 1e-4]
 
 
 def test_a_file_of_the_tree_is_read_again_when_it_has_changed(tmp_path: Path) -> None:

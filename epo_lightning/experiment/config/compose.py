@@ -13,12 +13,14 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from epo_lightning.experiment.config.messages import one_sentence, refuse_merged, sentence
-from epo_lightning.experiment.config.sources import GROUP, file_of, options_of, recorded_name
-from epo_lightning.identity import canonical, essence, of_row
+from epo_lightning.experiment.config.sources import EXPERIMENTS, GROUP, file_of, options_of, recorded_name
+from epo_lightning.identity import canonical, essence, leaves, of_row
 from epo_lightning.registry import ConfigError, parts
+from epo_lightning.report.labels import value_text
+from epo_lightning.report.labels import word as override
 
 if TYPE_CHECKING:
     from hydra._internal.hydra import Hydra
@@ -95,8 +97,8 @@ def resolve(config: DictConfig) -> dict[str, Any]:
     without the seed. A title from the experiment's file gets the names of backbone and forecaster where they differ from it.
 
     Raises:
-        ConfigError: an interpolation of a key that does not exist, a value that is still missing, or settings of a
-            part that the forecaster does not take.
+        ConfigError: an interpolation of a key that does not exist, a value that is still missing, settings of a part that
+            the forecaster does not take, or a setting of the experiment's file that the budget replaces.
     """
     from hydra.core.global_hydra import GlobalHydra
 
@@ -110,12 +112,15 @@ def resolve(config: DictConfig) -> dict[str, Any]:
     if "trainer" in values:
         own = canonical(essence(of_row(values)))
         words = tuple(f"{group}={choices[group]}" for group in ("experiment", "budget") if choices.get(group))
-        search_path = GlobalHydra.instance().config_loader().get_search_path().get_path()
-        written = _as_written(words, tuple(entry.path for entry in search_path))
+        entries = GlobalHydra.instance().config_loader().get_search_path().get_path()
+        search_path = tuple(entry.path for entry in entries)
+        written = _as_written(words, search_path)
         same = written is not None and own == canonical(essence(of_row(written)))
         values["variant"] = "" if same else hashlib.sha256(own.encode()).hexdigest()[:6]
         if written is not None and choices.get("experiment"):
             values["title"] = _true_title(values, written)
+        if "hydra" in config:
+            _refuse_replaced(values, config.hydra.overrides.task, _replaced(words, search_path))
     return values
 
 
@@ -151,6 +156,66 @@ def _refuse_ignored(values: Mapping[str, Any], overrides: Iterable[str]) -> None
         f"{given[0].group()} has no effect on forecaster={name}, which takes no {part}: {there}; in a sweep over several "
         f"forecasters, write it into experiment files{how}"
     )
+
+
+def _refuse_replaced(values: Mapping[str, Any], overrides: Iterable[str], replaced: Sequence[_Replaced]) -> None:
+    """Refuse settings of the experiment's file that have no effect, because the budget's file replaces them.
+
+    Args:
+        values: the resolved configuration.
+        overrides: all overrides; a key that they set does not depend on the two files.
+        replaced: settings of the experiment's file to which the budget's file gives another value.
+
+    Raises:
+        ConfigError: the keys and values of both files, and where such a setting can stand.
+    """
+    final = dict(leaves(values))
+    given = {word.lstrip("+~").partition("=")[0] for word in overrides}
+    lost = [one for one in replaced if one.key not in given and final.get(one.key) == one.by]
+    if lost:
+        own = [f"{one.key}: {value_text(one.value)}" for one in lost]
+        others = [f"{one.key}: {value_text(one.by)}" for one in lost]
+        raise ConfigError(
+            f"{lost[0].file} sets {', '.join(own)} without effect: the budget's file {lost[0].budget} is read later and "
+            f"sets {', '.join(others)}; move such settings to the command line "
+            f"({' '.join(override(one.key, one.value) for one in lost)}), to the file of a sweep, or to a budget of your own"
+        )
+
+
+class _Replaced(NamedTuple):
+    """A setting of the file of an experiment to which the budget's file gives another value."""
+
+    key: str
+    value: Any
+    file: str
+    by: Any
+    budget: str
+
+
+@cache
+def _replaced(words: tuple[str, ...], search_path: tuple[str, ...]) -> list[_Replaced]:
+    """The settings of an experiment's file, and of the files it is based on, to which the budget gives another value."""
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.errors import HydraException
+    from hydra.types import RunMode
+    from omegaconf import OmegaConf
+
+    instance = GlobalHydra.instance().hydra
+    assert instance is not None
+    loader = instance.config_loader
+    try:
+        entries = loader.compute_defaults_list("train", list(words), RunMode.RUN).defaults
+    except HydraException:  # the files need other overrides of the run
+        return []
+    found: dict[str, dict[str, tuple[Any, str]]] = {EXPERIMENTS: {}, "budget": {}}
+    for group, _, option in (str(entry.config_path).partition("/") for entry in entries):
+        loaded = loader.repository.load_config(f"{group}/{option}") if group in found else None
+        if loaded is not None:
+            settings: Any = OmegaConf.to_container(loaded.config, resolve=False)
+            file = file_of(instance, group, option)
+            found[group].update({key: (value, file) for key, value in leaves(settings)})
+    own, budget = found.values()
+    return [_Replaced(key, *own[key], *budget[key]) for key in own if key in budget and own[key][0] != budget[key][0]]
 
 
 def _true_title(values: Mapping[str, Any], written: Mapping[str, Any]) -> Any:
@@ -262,8 +327,8 @@ def _params(instance: Hydra, config: DictConfig) -> list[str]:
             parser.parse_override(word)
         except HydraException as error:
             raise ConfigError(
-                f"{file}: cannot read `{key}: {value}`, expected a value, or several with commas between them: `{key}: a,b`; "
-                "a value with other than plain letters, digits and ._-/ needs quotes of its own, \"'value'\""
+                f"{file}: cannot read `{key}: {value}`, expected a value, or several with commas between them: "
+                f"`{key}: a,b`; a value with other than plain letters, digits and ._-/ needs quotes of its own, \"'value'\""
             ) from error
         refuse_merged(instance, word, f"{file}: ")
         words.append(word)

@@ -102,8 +102,8 @@ def _override(instance: Hydra, group: str, option: str, overrides: Sequence[str]
     if any(word.startswith(f"+{group}=") for word in overrides):
         return f"+{group}={option}: {group} has an option already, so leave out the plus: {group}={option}"
     return (
-        f"{group} has an option already: in the defaults list of {file_of(instance, EXPERIMENTS, _chosen(overrides))}, or of a file that "
-        f"it is based on, write `- override /{group}: {option}`, with the slash"
+        f"{group} has an option already: in the defaults list of {file_of(instance, EXPERIMENTS, _chosen(overrides))}, "
+        f"or of a file that it is based on, write `- override /{group}: {option}`, with the slash"
     )
 
 

@@ -41,10 +41,11 @@ class ParsedOnce(FileConfigSource):
                 loaded = super().load_config(config_path)
             except (YAMLError, UnicodeDecodeError) as error:
                 raise ConfigError(_where(file, error)) from error
-            if config_path.partition("/")[0] in GLOBAL and loaded.header.get("package") != "_global_":
+            group = config_path.partition("/")[0]
+            if group in GLOBAL and loaded.header.get("package") != "_global_":
                 raise ConfigError(
-                    f"{file} must begin with the line `# @package _global_`, as every file in {config_path.partition('/')[0]}/ "
-                    "does (in UTF-8 without a byte order mark)"
+                    f"{file} must begin with the line `# @package _global_`, as every file in {group}/ does "
+                    "(in UTF-8 without a byte order mark)"
                 )
             _PARSED[key] = pickle.dumps(loaded)
         # Hydra changes what it is given, so that every composition gets a copy.
