@@ -52,17 +52,17 @@ def labels(
     keys = short_keys(list(settings[0]), config)
     complete = {key: _long_union([own[key] for own in settings]) for key in keys}
 
-    def parts(own: Mapping[str, Any], shown: Callable[[Any], str]) -> Iterator[str]:
+    def parts(own: Mapping[str, Any], text: Callable[[Any], str]) -> Iterator[str]:
         for key, value in own.items():
             if not complete[key]:
-                yield f"{keys[key]}={shown(value)}"
+                yield f"{keys[key]}={text(value)}"
             elif lacking := [entry for entry in complete[key] if entry not in value]:
                 yield f"{keys[key]} without {', '.join(lacking)}"
 
-    def named(shown: Callable[[Any], str]) -> list[str]:
-        return [", ".join([title, *parts(own, shown)]) for own in settings]
+    def named(text: Callable[[Any], str]) -> list[str]:
+        return [", ".join([title, *parts(own, text)]) for own in settings]
 
-    names = named(lambda value: _shown(_rounded(value)))
+    names = named(shown)
     if len({*names}) < len(names):
         names = named(_shown)
     if len(keys) > MOST:
@@ -98,13 +98,17 @@ def natural(settings: Mapping[str, Any]) -> tuple[tuple[int, float, str], ...]:
     )
 
 
-def _rounded(value: Any) -> Any:
-    """A number with few digits, since a search draws more than a label needs."""
-    return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
+def shown(value: Any) -> str:
+    """The text of a value in a label: a number with few digits, since a search draws more than a label needs."""
+    return _shown(float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value)
 
 
 def _shown(value: Any) -> str:
-    text = value_text(value)
+    return shortened(value_text(value))
+
+
+def shortened(text: str) -> str:
+    """A text, or the beginning of a long one."""
     return text if len(text) <= LONGEST else text[: LONGEST - 1] + "…"
 
 

@@ -17,6 +17,7 @@ from rich.text import Text
 
 from epo_lightning.experiment.sweeps.sweep import Job, State, Sweep
 from epo_lightning.registry import ConfigError
+from epo_lightning.report.labels import MOST, short_keys, shortened, shown
 from epo_lightning.report.timings import duration
 from epo_lightning.run_folder import read_json
 
@@ -52,18 +53,51 @@ def status(sweep: Sweep) -> Counter[State]:
 
 
 def names_of(jobs: Sequence[Job]) -> dict[Path, str]:
-    """Unique names of runs: title and seed, with the data set and the folder only where they are needed."""
+    """Unique names of runs: title, settings in which runs of a title differ, and seed.
+
+    The data set and the folder are added only where they are needed.
+    """
     data: dict[str, set[str]] = {}
     for job in jobs:
         data.setdefault(job.title, set()).add(job.data)
     titles = {title: "{} ({})" if len(found) > 1 else "{}" for title, found in data.items()}
-    names = {job.run.path: f"{titles[job.title].format(job.title, job.data)}, seed {job.seed}" for job in jobs}
+    rows: dict[str, list[Job]] = {}
+    for job in jobs:
+        rows.setdefault(titles[job.title].format(job.title, job.data), []).append(job)
+    labelled = ((job, f"{title}{label}") for title, same in rows.items() for job, label in _labelled(same))
+    found = {job.run.path: f"{name}, seed {job.seed}" for job, name in labelled}
+    names = {job.run.path: found[job.run.path] for job in jobs}
     counts = Counter(names.values())
     folders = Counter((names[job.run.path], job.run.path.name) for job in jobs)
     for path, name in names.items():
         if counts[name] > 1:
             names[path] = f"{name} ({'/'.join(path.parts[-2 if folders[name, path.name] > 1 else -1 :])})"
     return names
+
+
+def _labelled(jobs: Sequence[Job]) -> Iterator[tuple[Job, str]]:
+    """Runs of a title, each with the overrides in which they differ: ``, lr=0.001``; with none if these are too many."""
+    settings = [_settings(job) for job in jobs]
+    keys = [key for key in {key: "" for own in settings for key in own} if len({own.get(key) for own in settings}) > 1]
+    short = short_keys(keys, {})
+    for job, own in zip(jobs, settings, strict=True):
+        parts = [f"{short[key]}={_value(own[key])}" for key in keys if key in own]
+        yield job, "".join(f", {part}" for part in parts) if len(keys) <= MOST else ""
+
+
+def _settings(job: Job) -> dict[str, str]:
+    """The values of a run's overrides, by key and without the seed, which names show anyway."""
+    given = (override.lstrip("+").partition("=") for override in job.overrides)
+    return {key: value for key, _, value in given if key != "seed"}
+
+
+def _value(text: str) -> str:
+    """A value as labels of a report show it."""
+    try:
+        number = float(text)
+    except ValueError:
+        return shortened(text)
+    return text if number.is_integer() else shown(number)
 
 
 def summary(counts: Counter[State]) -> str:

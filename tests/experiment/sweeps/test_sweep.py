@@ -234,6 +234,32 @@ def test_runs_of_one_title_and_seed_have_distinct_names(tmp_path: Path) -> None:
     ]
 
 
+def test_runs_of_a_grid_are_named_by_their_settings() -> None:
+    def names(*listed: str) -> list[str]:
+        jobs = [
+            Job(tuple(words.split()), RunFolder(Path(f"r/s0-{i}")), "", "EPO", int("seed=1" in words), ())
+            for i, words in enumerate(listed)
+        ]
+        return list(names_of(jobs).values())
+
+    both = "experiment=rpi/v_lstm_epo budget=short"
+    assert names(
+        f"{both} optimizer.lr=1e-3 solver.steps=2 seed=0", f"{both} optimizer.lr=3.7848e-4 solver.steps=4 seed=1"
+    ) == [
+        "EPO, lr=0.001, steps=2, seed 0",
+        "EPO, lr=0.000378, steps=4, seed 1",
+    ]
+    assert names("experiment=a seed=0", "experiment=a +data.games_share=0.5 seed=0") == [
+        "EPO, seed 0",
+        "EPO, games_share=0.5, seed 0",
+    ]
+    assert names("data.test=[USA_US101-15_2_T-1,USA_US101-2_1_T-1]", "data.test=[x]")[0] == (
+        "EPO, test=[USA_US101-15_2_T-1,USA…, seed 0"
+    )
+    assert names("optimizer.lr=0.00012345", "optimizer.lr=0.00012346")[0] == "EPO, lr=0.000123, seed 0 (s0-0)"
+    assert names("a=1 b=1 c=1 d=1 e=1", "a=2 b=2 c=2 d=2 e=2")[1] == "EPO, seed 0 (s0-1)"
+
+
 def test_damaged_runs_are_named_before_anything_runs(epo: Epo, refused: Callable[..., str]) -> None:
     words = ("sweep", "rpi_main", *TINY, "seed=0", "score=test", "experiment=rpi/v_lstm")
     assert epo(*words) == 0
