@@ -117,7 +117,7 @@ def test_a_sweep_that_measures_scores_and_time_is_reported(runs: Path) -> None:
     folders = [f"{title}-s{seed}" for title in ("JFP", "EPO", "Laplace") for seed in (0, 1)]
     sweep = begin(runs, "table1", dict.fromkeys(folders), score=["test", "time"])
     (runs / "Laplace-s1" / "runtime.json").unlink()
-    assert [sweep.state(job) for job in sweep.jobs] == ["done"] * 5 + ["interrupted"]
+    assert [sweep.state(job) for job in sweep.jobs] == ["done"] * 5 + ["trained, not scored"]
     assert {run.split for run in of_sweep(sweep).evaluated} == {"test"}
     written = (report(ReportSettings(sweep="table1")) / "results.md").read_text()
     titles = [line for line in written.splitlines() if line.startswith("## ")]

@@ -202,7 +202,7 @@ def _replaced(words: tuple[str, ...], search_path: tuple[str, ...]) -> list[_Rep
 
     instance = GlobalHydra.instance().hydra
     assert instance is not None
-    loader = instance.config_loader
+    loader: Any = instance.config_loader
     try:
         entries = loader.compute_defaults_list("train", list(words), RunMode.RUN).defaults
     except HydraException:  # the files need other overrides of the run
@@ -320,7 +320,7 @@ def _params(instance: Hydra, config: DictConfig) -> list[str]:
         if isinstance(value, DictConfig):
             inner, first = next(iter(value.items()), ("<key>", "<values>"))
             raise ConfigError(
-                f"{file}: {key} is a section, expected dotted keys with their values: write `{key}.{inner}: {first}`"
+                f"{file}: {key} is a section, expected dotted keys with their values: write `{key}.{inner!s}: {first}`"
             )
         word = f"{key}={value}"
         try:

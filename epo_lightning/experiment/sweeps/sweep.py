@@ -40,7 +40,7 @@ from epo_lightning.report.runs import data_name
 from epo_lightning.run_folder import LOCK, RunFolder, read_json, write_file, write_json
 from epo_lightning.schema import read
 
-State = Literal["waiting", "running", "interrupted", "failed", "done"]
+State = Literal["done", "running", "interrupted", "trained, not scored", "failed", "waiting"]
 BESIDE = (
     *("logger", "existing", "runs", "sweep", "sweeps"),
     *("hydra/launcher", "hydra.launcher", "hydra/hydra_logging", "hydra.sweep", "hydra.job", "hydra.verbose"),
@@ -101,9 +101,9 @@ class Job:
         )
 
     @property
-    def measured(self) -> bool:
-        """Whether the files of all measurements exist in the run folder."""
-        return all(self.run.metrics_file(which).is_file() for which in self.measures)
+    def lacking(self) -> tuple[Measured, ...]:
+        """The measurements whose files do not exist in the run folder."""
+        return tuple(which for which in self.measures if not self.run.metrics_file(which).is_file())
 
 
 @dataclass(frozen=True)
@@ -199,15 +199,16 @@ class Sweep:
 
     def state(self, job: Job) -> State:
         """State of a run: ``done`` if it is trained and measured, ``failed`` also if its folder is damaged."""
+        state: State | Literal["finished"]
         try:
             state = job.run.state
         except ConfigError:
             return "failed"
         if state == "finished":
-            if job.measured:
+            if not job.lacking:
                 return "done"
-            state = "running" if job.run.locked else "interrupted"
-        return "failed" if state in ("waiting", "interrupted") and self._failure(job.run).is_file() else state
+            state = "running" if job.run.locked else "trained, not scored"
+        return "failed" if state not in ("running", "failed") and self._failure(job.run).is_file() else state
 
     def error(self, job: Job) -> str:
         """Error message of a failed run in one line; empty if it has not failed."""

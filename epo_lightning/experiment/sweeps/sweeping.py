@@ -295,7 +295,7 @@ def _launch(
             left = [job for job in left if sweep.state(job) not in ("done", "failed")]
             print(f"{len(left)} runs are left", flush=True)
     for job in left:
-        if sweep.state(job) == "interrupted":
+        if sweep.state(job) in ("interrupted", "trained, not scored"):
             sweep.lost(job)
 
 

@@ -17,17 +17,19 @@ from rich.text import Text
 
 from epo_lightning.experiment.sweeps.sweep import Job, State, Sweep
 from epo_lightning.registry import ConfigError
-from epo_lightning.report.labels import MOST, short_keys, shortened, shown
+from epo_lightning.report.labels import MOST, short_keys, shortened, shown, word
 from epo_lightning.report.timings import duration
 from epo_lightning.run_folder import read_json
 
 STYLES: dict[State, str] = {
+    "done": "green",
     "running": "cyan",
     "interrupted": "yellow",
+    "trained, not scored": "yellow",
     "failed": "bold red",
-    "done": "green",
     "waiting": "",
 }
+"""Colours of all states, in the order of a summary."""
 POLL = 2.0
 """Seconds between two checks of the run folders."""
 
@@ -47,9 +49,20 @@ def status(sweep: Sweep) -> Counter[State]:
     console.print(table)
     counts = Counter(states)
     console.print(f"{summary(counts)}; they lie below {sweep.root}", highlight=False, markup=False, soft_wrap=True)
-    if (counts["interrupted"] or counts["waiting"]) and not counts["running"]:
+    if (counts["interrupted"] or counts["waiting"] or counts["trained, not scored"]) and not counts["running"]:
         console.print("give the same command again to continue", highlight=False)
+    unscored = (job for job, state in zip(jobs, states, strict=True) if state == "trained, not scored")
+    if command := next((_scoring(job) for job in unscored if job.lacking != ("time",)), ""):
+        console.print(
+            f"it also scores what is trained; a single run: {command}", highlight=False, markup=False, soft_wrap=True
+        )
     return counts
+
+
+def _scoring(job: Job) -> str:
+    """The command that scores a trained run."""
+    split = "" if "test" in job.lacking else " split=val"
+    return f"epo evaluate {word('run', str(job.run.path))}{split}"
 
 
 def names_of(jobs: Sequence[Job]) -> dict[Path, str]:
@@ -102,9 +115,7 @@ def _value(text: str) -> str:
 
 def summary(counts: Counter[State]) -> str:
     """``12 runs: 5 done, 1 running, 6 waiting``"""
-    parts = [
-        f"{counts[state]} {state}" for state in ("done", "running", "interrupted", "failed", "waiting") if counts[state]
-    ]
+    parts = [f"{counts[state]} {state}" for state in STYLES if counts[state]]
     total = counts.total()
     return f"{total} run{'' if total == 1 else 's'}: {', '.join(parts) or 'none'}"
 
@@ -114,8 +125,8 @@ def _details(sweep: Sweep, job: Job, state: State) -> str:
         return how_far(job)
     if state == "failed":
         return sweep.error(job)
-    if state == "interrupted" and job.run.finished:
-        return "trained, not scored yet"
+    if state == "trained, not scored":
+        return f"lacks {' and '.join(job.lacking)}"
     if state == "interrupted":
         return how_far(job) if job.run.progress else ""
     return result(job) if state == "done" else ""

@@ -69,12 +69,13 @@ def test_a_sweep_trains_and_scores_every_run_once(epo: Epo, capsys: pytest.Captu
     first.metrics_file().unlink()
     second.update(status="training")
     second.metrics_file().unlink()
-    assert [sweep.state(job) for job in sweep.jobs].count("interrupted") == 2
+    assert [sweep.state(sweep.jobs[i]) for i in (2, 3)] == ["trained, not scored", "interrupted"]
     capsys.readouterr()
     assert epo("sweep", "status", "rpi_main") == 0
     shown = capsys.readouterr().out
-    assert "6 done, 2 interrupted" in shown
-    assert shown.count("trained, not scored yet") == 1
+    assert "6 done, 1 interrupted, 1 trained, not scored" in shown
+    assert "lacks test" in shown
+    assert f"it also scores what is trained; a single run: epo evaluate run={first.path}\n" in shown
     assert epo(*SWEEP) == 0
     assert {sweep.state(job) for job in sweep.jobs} == {"done"}
     assert {path for path, mark in marks(sweep).items() if mark != before[path]} == {str(first.path), str(second.path)}
@@ -179,7 +180,7 @@ def test_a_run_is_done_when_all_measurements_exist(epo: Epo, capsys: pytest.Capt
     capsys.readouterr()
     for which in job.measures:
         job.run.metrics_file(which).rename(folder / "aside")
-        assert sweep.state(job) == "interrupted"
+        assert sweep.state(job) == "trained, not scored"
         (folder / "aside").rename(job.run.metrics_file(which))
     scores = r"val/minSADE \d+\.\d{4}, test/minSADE \d+\.\d{4}"
     assert re.fullmatch(scores + r", \d+ s, \d+\.\d ms per forecast", result(job))
