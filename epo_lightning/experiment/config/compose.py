@@ -318,9 +318,9 @@ def _params(instance: Hydra, config: DictConfig) -> list[str]:
     words = []
     for key, value in (config.hydra.sweeper.get("params") or {}).items():
         if isinstance(value, DictConfig):
-            inner, first = next(iter(value.items()), ("<key>", "<values>"))
+            inner, first = next(((str(own), given) for own, given in value.items()), ("<key>", "<values>"))
             raise ConfigError(
-                f"{file}: {key} is a section, expected dotted keys with their values: write `{key}.{inner!s}: {first}`"
+                f"{file}: {key} is a section, expected dotted keys with their values: write `{key}.{inner}: {first}`"
             )
         word = f"{key}={value}"
         try:

@@ -4,7 +4,7 @@
 
     <runs>/sweeps/<label>/
         sweep.json       the command, and every run: its overrides, its folder (relative to <runs>) and its identity;
-                         with choices=<file>, the contents of that file
+                         with choices=<file>, the contents of that file; folders of runs that are no longer part of it
         found/           the same for runs that a searching sweeper (Optuna) has chosen, one file each
         failures/        tracebacks of runs that failed in the last attempt, one file each
         .lock            locked as long as the sweep runs
@@ -55,6 +55,7 @@ _RECORD = {
     "process": WHOLE,
     "jobs": OBJECTS,
     "choices": OBJECT,
+    "former": TEXTS,
 }
 _JOB = {"overrides": TEXTS, "folder": TEXT, "identity": TEXT, "title": TEXT, "seed": WHOLE}
 _SCORE: Check = ("a list of texts", lambda value: value is None or TEXT[1](value) or TEXTS[1](value))
@@ -170,6 +171,11 @@ class Sweep:
         found = [(path, _content(path)) for path in sorted((self.folder / "found").glob("*.json"))]
         return [self._job(where, entry) for where, entry in [*((file, e) for e in self.record.get("jobs", [])), *found]]
 
+    @property
+    def former(self) -> list[RunFolder]:
+        """Runs of earlier starts that are no longer part of the sweep, because its file has changed since."""
+        return [RunFolder(path) for name in self.record.get("former", ()) if (path := self.root / name).exists()]
+
     def _job(self, file: Path, entry: Mapping[str, Any]) -> Job:
         where = f"{file}, a run of the sweep,"
         check_entries(entry, _JOB, where, AGAIN)
@@ -263,6 +269,8 @@ class Sweep:
         """Write sweep.json with all runs, and delete the tracebacks of earlier attempts."""
         for failure in (self.folder / "failures").glob("*.txt"):
             failure.unlink()
+        before = self.record if (self.folder / "sweep.json").is_file() else {}
+        earlier = {*before.get("former", ()), *(entry["folder"] for entry in before.get("jobs", ()))}
         content = {
             "name": name,
             "label": self.label,
@@ -275,6 +283,7 @@ class Sweep:
             "host": socket.gethostname(),
             "stop_on_failure": stop_on_failure,
             "jobs": [self._entry(job) for job in jobs],
+            "former": sorted(earlier - {self._place(job.run) for job in jobs}),
             **({"choices": mask(dict(choices))} if choices else {}),
         }
         write_json(self.folder / "sweep.json", content)

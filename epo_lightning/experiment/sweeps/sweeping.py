@@ -19,7 +19,7 @@ from epo_lightning.experiment.config.settings import Settings, TrainerSettings
 from epo_lightning.experiment.config.sources import options_of
 from epo_lightning.experiment.provenance import of_other_code
 from epo_lightning.experiment.sweeps.sweep import Job, State, Sweep
-from epo_lightning.experiment.sweeps.watch import news, status, summary
+from epo_lightning.experiment.sweeps.watch import news, note_former, status, summary
 from epo_lightning.experiment.verbs import check_settings, make_data
 from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError, nearest
@@ -82,6 +82,7 @@ def run(
         )
         if jobs:
             print(f"{sweep.label}: {summary(Counter(states))}", flush=True)
+            note_former(sweep)
             _note_other_code(jobs, states)
         with news(sweep):
             if jobs:

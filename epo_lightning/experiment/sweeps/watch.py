@@ -49,6 +49,7 @@ def status(sweep: Sweep) -> Counter[State]:
     console.print(table)
     counts = Counter(states)
     console.print(f"{summary(counts)}; they lie below {sweep.root}", highlight=False, markup=False, soft_wrap=True)
+    note_former(sweep)
     if (counts["interrupted"] or counts["waiting"] or counts["trained, not scored"]) and not counts["running"]:
         console.print("give the same command again to continue", highlight=False)
     unscored = (job for job, state in zip(jobs, states, strict=True) if state == "trained, not scored")
@@ -57,6 +58,16 @@ def status(sweep: Sweep) -> Counter[State]:
             f"it also scores what is trained; a single run: {command}", highlight=False, markup=False, soft_wrap=True
         )
     return counts
+
+
+def note_former(sweep: Sweep) -> None:
+    """Print how many runs of earlier starts are no longer part of the sweep."""
+    if former := sweep.former:
+        those = "1 run of an earlier start is" if len(former) == 1 else f"{len(former)} runs of earlier starts are"
+        print(
+            f"{those} no longer part of this sweep, because its file has changed since; the folder stays: {former[0].path}",
+            flush=True,
+        )
 
 
 def _scoring(job: Job) -> str:

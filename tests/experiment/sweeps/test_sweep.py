@@ -81,6 +81,32 @@ def test_a_sweep_trains_and_scores_every_run_once(epo: Epo, capsys: pytest.Captu
     assert {path for path, mark in marks(sweep).items() if mark != before[path]} == {str(first.path), str(second.path)}
 
 
+def test_runs_that_an_edited_sweep_has_no_longer_are_counted(
+    epo: Epo, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "conf" / "sweeps" / "mine.yaml"
+    file.parent.mkdir(parents=True)
+    words = ("sweep", "mine", f"--config-dir={tmp_path / 'conf'}", "data=tiny", "budget=untrained")
+
+    def said(seeds: str) -> str:
+        text = f"# @package _global_\nhydra: {{sweeper: {{params: {{experiment: rpi/v_lstm, seed: '{seeds}'}}}}}}\n"
+        file.write_text(text)
+        os.utime(file, (len(seeds), len(seeds)))  # files are read again when their time has changed
+        capsys.readouterr()
+        assert epo(*words) == 0
+        return capsys.readouterr().out
+
+    assert "no longer" not in said("0,1,2")
+    assert (
+        said("1").count("2 runs of earlier starts are no longer part of this sweep, because its file has changed") == 2
+    )
+    assert epo("sweep", "status", "mine") == 0
+    out = capsys.readouterr().out
+    assert re.search(r"2 runs of .*; the folder stays: \S+/runs/rpi/v_lstm/untrained-s0-\w+\n", out)
+    assert "1 run of an earlier start is no longer part" in said("1,0")
+    assert "no longer" not in said("0,1,2,3")
+
+
 def test_a_failed_run_is_reported_and_does_not_stop_the_others(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
     words = (*SWEEP, "optimizer.lr=1e25")
     assert epo(*words) == 1
