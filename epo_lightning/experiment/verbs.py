@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import inspect
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -23,6 +24,7 @@ from epo_lightning.experiment.config.settings import (
     measures,
 )
 from epo_lightning.registry import ConfigError
+from epo_lightning.report.labels import word
 from epo_lightning.run_folder import RunFolder, read_json
 from epo_lightning.schema import check_part, read
 
@@ -65,7 +67,7 @@ def generate_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None
     else:
         rows = "ucy" if not data.task.map else "urban" if settings.data.get("windows", {}).get("lines") else "exid"
         words = [f"experiment={rows}/v_lstm_epo", *kept]
-    print(f"\nnext: epo train {' '.join(words)} budget=short" + " (minutes; without a budget: the paper's settings)")
+    print(f"\nnext: epo train {shlex.join(words)} budget=short" + " (minutes; without a budget: the paper's settings)")
 
 
 def make_data(settings: GenerateSettings, overrides: Sequence[str] = ()) -> Any:
@@ -149,7 +151,8 @@ def _print_trained(run: RunFolder) -> float | None:
         if which in asked and run.metrics_file(which).is_file():
             print(f"  {which}: {_headline(read_json(run.metrics_file(which)).get('metrics', {}))}")
     scored = all(run.metrics_file(which).is_file() for which in asked)
-    print(f"run folder: {run.path}\nnext: epo {f'report runs={run.path}' if scored else f'evaluate run={run.path}'}")
+    verb, key = ("report", "runs") if scored else ("evaluate", "run")
+    print(f"run folder: {run.path}\nnext: epo {verb} {word(key, str(run.path))}")
     return best[1] if best else None
 
 
@@ -178,7 +181,7 @@ def evaluate_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None
         elif not own and file.is_file():
             print(f"  in {file}")
     if settings.run not in pretrained.names():
-        print(f"next: epo report runs={settings.runs or settings.run}")
+        print(f"next: epo report {word('runs', settings.runs or settings.run)}")
 
 
 def _tested_on(file: Path, data: Mapping[str, Any] | None) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 
@@ -54,6 +55,21 @@ def test_a_run_folder_holds_what_a_run_needs(epo: Epo) -> None:
     assert run.checkpoint("last").is_file()
     assert not run.metrics_file().exists(), "the test split is nobody's business while training"
     assert "run_dir" in yaml.safe_load(run.config_file.read_text())
+
+
+def test_the_next_commands_are_quoted_for_a_shell(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
+    def following(*words: str) -> list[str]:
+        assert epo(*words) == 0
+        (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("next: epo "))
+        return shlex.split(line)[2:]
+
+    trained = following(
+        "train", ROW, "data=tiny", "budget=untrained", "callbacks.progress=none", "run_dir='my runs/a b'"
+    )
+    assert trained[0] == "evaluate"
+    scored = following(*trained)
+    assert scored[0] == "report"
+    assert epo(*scored, "out=out") == 0
 
 
 def test_checkpoints_load_from_anywhere_and_forecast(epo: Epo, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
