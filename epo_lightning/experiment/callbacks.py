@@ -80,7 +80,9 @@ class NextEpoch(Callback):
         progress = loop.epoch_progress
         progress.total.completed, progress.current.completed = progress.total.processed, progress.current.processed
         loop.on_iteration_done()  # as after an epoch of an uninterrupted run
-        loop.epoch_loop.restarting = False  # the setter of `loop` itself ignores this value in runs of a number of steps
+        loop.epoch_loop.restarting = (
+            False  # the setter of `loop` itself ignores this value in runs of a number of steps
+        )
 
 
 # The two classes below have the names of Lightning's classes, because checkpoints store callback states under these names.

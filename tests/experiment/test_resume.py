@@ -96,7 +96,12 @@ def test_a_run_that_had_stopped_early_makes_no_further_step(epo: Epo) -> None:
 @pytest.mark.parametrize("between", [2, 3, 5, 8])
 def test_a_run_that_validates_after_a_number_of_steps_goes_on_with_the_next_epoch(epo: Epo, between: int) -> None:
     """Epochs of four steps: validations are at their ends, or not, or at some of them."""
-    words = ("trainer.max_epochs=null", "trainer.max_steps=18", f"trainer.validate_steps={between}", "trainer.log_every=1")
+    words = (
+        "trainer.max_epochs=null",
+        "trainer.max_steps=18",
+        f"trainer.validate_steps={between}",
+        "trainer.log_every=1",
+    )
     kept = without("trainer.max_epochs")
     words = (*kept, *words, "trainer.limit_train_batches=4")
     assert epo(*words, "run_dir=whole") == 0
