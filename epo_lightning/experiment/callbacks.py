@@ -77,12 +77,10 @@ class NextEpoch(Callback):
         loop = trainer.fit_loop
         if not loop.restarted_on_epoch_end:
             return
-        progress = loop.epoch_progress
-        progress.total.completed, progress.current.completed = progress.total.processed, progress.current.processed
+        loop.epoch_progress.increment_completed()
         loop.on_iteration_done()  # as after an epoch of an uninterrupted run
-        loop.epoch_loop.restarting = (
-            False  # the setter of `loop` itself ignores this value in runs of a number of steps
-        )
+        # The setter of `loop` itself ignores this value in runs of a number of steps.
+        loop.epoch_loop.restarting = False
 
 
 # The two classes below have the names of Lightning's classes, because checkpoints store callback states under these names.
