@@ -130,10 +130,8 @@ class _Game:
         custom, scene = self.custom, self.scene
         around = custom.surroundings(scene, self.parameters)
         states = custom.dynamics.rollout(custom.current_states(scene), controls, scene.dt)
-        unit = torch.eye(GIVEN - 1, dtype=controls.dtype)[:, None, None, None, None].expand(
-            -1, *controls.shape[:-1], -1
-        )
-        moved = unit[..., :4], unit[..., 4:]
+        unit = torch.eye(GIVEN - 1, dtype=controls.dtype)[:, None, None, None, None]
+        moved = unit[..., :4].expand(-1, *states.shape), unit[..., 4:].expand(-1, *controls.shape)
         rows = []
         for name in custom.own:
             value, by = custom.own_residual(name, scene, self.parameters, around, (states, controls), moved)
@@ -145,10 +143,8 @@ class _Game:
     ) -> tuple[Tensor, list[Tensor]]:
         """The gradient of the user's part of phi by the controls and by the weights of the user's features."""
         with torch.enable_grad():
-            controls, leaves = (
-                controls.detach().requires_grad_(),
-                [weight.detach().requires_grad_() for weight in weights],
-            )
+            controls = controls.detach().requires_grad_()
+            leaves = [weight.detach().requires_grad_() for weight in weights]
             parameters = dataclasses.replace(
                 self.parameters, own_weights=dict(zip(self.custom.own, leaves, strict=True))
             )
