@@ -199,6 +199,9 @@ def build_trainer(
     # With deterministic algorithms, PyTorch would fill every new tensor with NaN before it is written, 5 % of a step's time.
     torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
     double = settings.precision == "64-true"
+    between = settings.validate_steps
+    if between is not None and settings.max_steps > 0:  # a shorter training is validated at its end
+        between = min(between, settings.max_steps)
     with naming(settings, run):
         return Trainer(
             default_root_dir=run.path,
@@ -215,7 +218,7 @@ def build_trainer(
             max_epochs=-1 if settings.max_epochs is None else settings.max_epochs,
             max_steps=settings.max_steps,
             check_val_every_n_epoch=settings.validate_every if settings.validate_steps is None else None,
-            val_check_interval=_steps_between_validations(settings),
+            val_check_interval=between,
             limit_train_batches=settings.limit_train_batches,
             limit_val_batches=settings.limit_val_batches,
             log_every_n_steps=settings.log_every,
@@ -227,13 +230,6 @@ def build_trainer(
             num_sanity_val_steps=0,
             inference_mode=False,  # the layer differentiates its energy also when it only forecasts
         )
-
-
-def _steps_between_validations(settings: TrainerSettings) -> int | None:
-    """Steps between two validations; a training that is shorter is validated at its end."""
-    if settings.validate_steps is None or settings.max_steps < 1:
-        return settings.validate_steps
-    return min(settings.validate_steps, settings.max_steps)
 
 
 @contextmanager

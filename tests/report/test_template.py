@@ -169,7 +169,7 @@ def test_the_sources_are_the_files_that_were_used(tmp_path: Path) -> None:
     lines = page.splitlines()
     assert len(lines) == 3
     assert lines[2].startswith("| [game](tables/game/results.md) | rpi_hard, recipe 2 (")
-    assert lines[2].endswith("| 81b9ee8, a951099 | 0 to 4 | 16 | 3670 | -4.9 to 0.0 % |")
+    assert lines[2].endswith("| 81b9ee8, 9dcc1de, a951099 | 0 to 4 | 16 | 3670 | -5.8 to 0.0 % |")
 
 
 def test_the_validation_score_is_the_lowest_of_the_log(tmp_path: Path) -> None:

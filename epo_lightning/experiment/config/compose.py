@@ -119,8 +119,8 @@ def resolve(config: DictConfig) -> dict[str, Any]:
         values["variant"] = "" if same else hashlib.sha256(own.encode()).hexdigest()[:6]
         if written is not None and choices.get("experiment"):
             values["title"] = _true_title(values, written)
-        if "hydra" in config:
-            _refuse_replaced(values, config.hydra.overrides.task, _replaced(words, search_path))
+        if "hydra" in config and (replaced := _replaced(words, search_path)):
+            _refuse_replaced(values, config.hydra.overrides.task, replaced)
     return values
 
 
@@ -388,7 +388,8 @@ def _composed(instance: Hydra, name: str, overrides: Sequence[str], multirun: bo
                 f"{word}: environment variables are not resolved in overrides, because run folders would keep their values; "
                 'let the shell replace them, key="$NAME", or write the interpolation into a file of the configuration tree'
             )
-        refuse_merged(instance, word)
+        if "=[" in word:
+            refuse_merged(instance, word)
     with one_sentence(instance, name, overrides):
         return instance.compose_config(
             config_name=name,

@@ -73,11 +73,10 @@ class TrainerSettings:
             value = getattr(self, name)
             if value <= 0 or (isinstance(value, float) and value > 1):
                 raise ConfigError(f"trainer.{name} must be a share in (0, 1] or a number of batches, not {value}")
-        self._check_graph()
+        if self.graph:
+            self._check_graph()
 
     def _check_graph(self) -> None:
-        if not self.graph:
-            return
         if self.accelerator == "cpu":
             raise ConfigError(
                 "trainer.graph=true on trainer.accelerator=cpu: CUDA graphs need trainer.accelerator=gpu or auto"
