@@ -35,7 +35,7 @@ SHAPES = ("disc", "box")
 """Outlines of agents: discs with the length as diameter, or boxes of length times width."""
 ACCELERATION, TURN_RATE = range(2)
 LARGEST_HEADING = 1e4
-"""Largest size of a heading [rad]: beyond it, single precision has no digits left for a direction."""
+"""Largest size of a heading [rad]: in single precision, rounding hides the direction of a larger one."""
 
 
 def wrapped(turn: Tensor) -> Tensor:
