@@ -41,7 +41,7 @@ def repeats_joined(
     that a score which takes the closest of equal modes takes the earliest one.
     """
     earliest = earliest_same(states, agent_mask)
-    scenes = torch.arange(len(states), device=states.device)[:, None]
+    scenes = torch.arange(states.shape[0], device=states.device)[:, None]  # `len` would be a constant in an export
     return states[scenes, earliest], controls[scenes, earliest], with_repeats_added(logits, earliest)
 
 

@@ -502,26 +502,27 @@ def test_settings_of_a_row_of_own_that_the_budget_replaces_are_refused(
         "experiment/rpi/mine": f"defaults: [/experiment/rpi/v_lstm, _self_]\n{own}",
         "experiment/rpi/other": "defaults: [/experiment/rpi/mine, _self_]\ntitle: other",
         "budget/mine": "budget: {name: mine}\noptimizer: {lr: 3.0e-4}",
-        "sweeps/mine": f"hydra: {{sweeper: {{params: {params}}}}}\ndata: {{batch_size: 8}}",
+        "sweeps/mine": f"hydra: {{sweeper: {{params: {params}}}}}\ndata: {{batch_size: 32}}",
     }.items():
         (conf / folder).parent.mkdir(parents=True, exist_ok=True)
         (conf / f"{folder}.yaml").write_text(f"# @package _global_\n{text}\n")
     said = (
         r"/experiment/rpi/mine\.yaml sets optimizer\.lr: 0\.0003, data\.batch_size: 8 without effect: the budget's file "
-        r".*conf/budget/smoke\.yaml is read later and sets optimizer\.lr: 0\.001, data\.batch_size: 16; move such settings "
-        r"to the command line \(optimizer\.lr=0\.0003 data\.batch_size=8\), to the file of a sweep, or to a budget"
+        r".*conf/budget/short\.yaml is read later and sets optimizer\.lr: 0\.001, data\.batch_size: 32; with this budget, "
+        r"move such settings to the command line \(optimizer\.lr=0\.0003 data\.batch_size=8\), to the file of a sweep"
     )
     words = (f"--config-dir={conf}", "data=tiny")
     for row in ("mine", "other"):
         for verb in (("train",), ("config", "check"), ("sweep", "rpi_main")):
-            assert re.search(said, refused(*verb, *words, f"experiment=rpi/{row}", "budget=smoke"))
+            assert re.search(said, refused(*verb, *words, f"experiment=rpi/{row}", "budget=short"))
 
     def learning_rate(*words: str) -> float:
         return compose("train", ["experiment=rpi/other", *words], [str(conf)])["optimizer"]["lr"]
 
     assert learning_rate("budget=mine") == 3e-4
-    assert learning_rate("budget=smoke", "optimizer.lr=1e-3", "data.batch_size=16") == 1e-3
-    listed = jobs("train", ["sweeps=mine", "budget=smoke"], [str(conf)])
+    assert learning_rate("budget=short", "optimizer.lr=1e-3", "data.batch_size=32") == 1e-3
+    assert learning_rate("budget=smoke") == 1e-3, "a budget for trials is small whatever else is written"
+    listed = jobs("train", ["sweeps=mine", "budget=short"], [str(conf)])
     assert [compose("train", job, [str(conf)])["optimizer"]["lr"] for job in listed] == [1e-3, 1e-4]
 
 

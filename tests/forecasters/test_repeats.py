@@ -10,10 +10,10 @@ import pytest
 import torch
 from hypothesis import given
 from test_game_horizon import SOLVER, built, scenes
-from torch import Tensor
+from torch import Tensor, nn
 
 from epo_lightning.forecast import DISTINCT, same_motion
-from epo_lightning.forecasters.repeats import earliest_same, with_repeats_added
+from epo_lightning.forecasters.repeats import earliest_same, repeats_joined, with_repeats_added
 from epo_lightning.metrics.functional import brier_min_sade
 
 
@@ -126,3 +126,21 @@ def test_a_game_with_one_equilibrium_has_one_outcome() -> None:
         forecast.states, forecast.probabilities, future, torch.ones(future.shape[:3], dtype=torch.bool)
     )
     assert score.tolist() == [0.0] * 3
+
+
+def test_a_program_takes_any_number_of_scenes() -> None:
+    class Joined(nn.Module):
+        def forward(self, states: Tensor, controls: Tensor, logits: Tensor, mask: Tensor) -> tuple[Tensor, ...]:
+            return repeats_joined(states, controls, logits, mask)
+
+    def given(scenes: int) -> tuple[Tensor, ...]:
+        states = torch.randn(scenes, 3, 2, 4, 4)
+        states[:, 2] = states[:, 0]
+        return states, torch.randn(scenes, 3, 2, 4, 2), torch.randn(scenes, 3), torch.ones(scenes, 2, dtype=torch.bool)
+
+    scenes = torch.export.Dim("scenes", min=1)
+    program = torch.export.export(Joined(), given(3), dynamic_shapes=tuple({0: scenes} for _ in range(4))).module()
+    for count in (1, 7):
+        arguments = given(count)
+        for found, wanted in zip(program(*arguments), repeats_joined(*arguments), strict=True):
+            assert torch.equal(found, wanted)

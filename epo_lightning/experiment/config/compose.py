@@ -119,8 +119,10 @@ def resolve(config: DictConfig) -> dict[str, Any]:
         values["variant"] = "" if same else hashlib.sha256(own.encode()).hexdigest()[:6]
         if written is not None and choices.get("experiment"):
             values["title"] = _true_title(values, written)
-        if "hydra" in config and (replaced := _replaced(words, search_path)):
-            _refuse_replaced(values, config.hydra.overrides.task, replaced)
+        # A budget for trials is small whatever else is written.
+        if "hydra" in config and choices.get("budget") != "smoke" and (replaced := _replaced(words, search_path)):
+            of_sweep = _keys_of_sweep(choices.get(GROUP))
+            _refuse_replaced(values, [*config.hydra.overrides.task, *of_sweep], replaced)
     return values
 
 
@@ -163,7 +165,7 @@ def _refuse_replaced(values: Mapping[str, Any], overrides: Iterable[str], replac
 
     Args:
         values: the resolved configuration.
-        overrides: all overrides; a key that they set does not depend on the two files.
+        overrides: all overrides, and the keys of a sweep's file; such a key does not depend on the two files.
         replaced: settings of the experiment's file to which the budget's file gives another value.
 
     Raises:
@@ -177,9 +179,20 @@ def _refuse_replaced(values: Mapping[str, Any], overrides: Iterable[str], replac
         others = [f"{one.key}: {value_text(one.by)}" for one in lost]
         raise ConfigError(
             f"{lost[0].file} sets {', '.join(own)} without effect: the budget's file {lost[0].budget} is read later and "
-            f"sets {', '.join(others)}; move such settings to the command line "
+            f"sets {', '.join(others)}; with this budget, move such settings to the command line "
             f"({' '.join(override(one.key, one.value) for one in lost)}), to the file of a sweep, or to a budget of your own"
         )
+
+
+def _keys_of_sweep(name: str | None) -> list[str]:
+    """The keys that the file of a sweep sets; none without a sweep."""
+    from hydra.core.global_hydra import GlobalHydra
+    from omegaconf import OmegaConf
+
+    loader: Any = GlobalHydra.instance().config_loader()
+    loaded = loader.repository.load_config(f"{GROUP}/{name}") if name else None
+    settings: Any = OmegaConf.to_container(loaded.config, resolve=False) if loaded else {}
+    return [key for key, _ in leaves(settings)]
 
 
 class _Replaced(NamedTuple):

@@ -267,10 +267,12 @@ class Sweep:
         choices: Mapping[str, Any] | None = None,
     ) -> None:
         """Write sweep.json with all runs, and delete the tracebacks of earlier attempts."""
+        before = self.record if (self.folder / "sweep.json").is_file() else {}
+        for entry in before.get("jobs", ()):
+            check_entries(entry, _JOB, f"{self.folder / 'sweep.json'}, a run of the sweep,", AGAIN)
+        earlier = {*before.get("former", ()), *(entry["folder"] for entry in before.get("jobs", ()))}
         for failure in (self.folder / "failures").glob("*.txt"):
             failure.unlink()
-        before = self.record if (self.folder / "sweep.json").is_file() else {}
-        earlier = {*before.get("former", ()), *(entry["folder"] for entry in before.get("jobs", ()))}
         content = {
             "name": name,
             "label": self.label,

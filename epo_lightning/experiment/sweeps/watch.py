@@ -65,7 +65,8 @@ def note_former(sweep: Sweep) -> None:
     if former := sweep.former:
         those = "1 run of an earlier start is" if len(former) == 1 else f"{len(former)} runs of earlier starts are"
         print(
-            f"{those} no longer part of this sweep, because its file has changed since; the folder stays: {former[0].path}",
+            f"{those} no longer part of this sweep, because files that it reads have changed since; the folder stays: "
+            f"{former[0].path}",
             flush=True,
         )
 

@@ -34,7 +34,7 @@ def obstacle(energy: FeatureEnergy, scene: Scene, parameters: GameParameters) ->
     """Reason why the kernel cannot solve a game with the help of PyTorch; None where it can."""
     custom, known = energy.custom, energy.built_in
     if custom is None or known is None:
-        return "an energy needs features that the compiled layer knows, and others"
+        return "the compiled layer needs a built-in feature beside those of the user, such as acc with a small weight"
     if custom.pair:
         return f"the compiled layer does not know the pair feature {custom.pair[0]!r}"
     for name, feature in custom.own_features.items():
@@ -59,13 +59,17 @@ def solve(
     """S damped Gauss-Newton steps; arguments and solution are those of :func:`.structured.solve`.
 
     Raises:
-        ValueError: steps with the Hessian, which the kernel does not get from PyTorch.
+        ValueError: weights that are not those of B scenes and M modes; or steps with the Hessian, which the kernel does not
+            get from PyTorch.
     """
     if exact:
         raise ValueError("steps with the Hessian need features that the kernel knows")
     assert energy.custom is not None
     assert energy.built_in is not None
     game = _Game(energy.custom, energy.built_in, scene, parameters, step_size, damping)
+    wrong = [list(weight.shape) for weight in game.weights if weight.shape[:2] != parameters.initial_controls.shape[:2]]
+    if wrong:
+        raise ValueError(f"weights of the shape {wrong[0]} for controls of {list(parameters.initial_controls.shape)}")
     controls = torch.where(scene.agent_mask[:, None, :, None, None], parameters.initial_controls, 0.0)
     status = torch.full(controls.shape[:2], Status.SOLVED)
     iterates, initial_energy = [controls], None

@@ -98,7 +98,10 @@ def test_runs_that_an_edited_sweep_has_no_longer_are_counted(
 
     assert "no longer" not in said("0,1,2")
     assert (
-        said("1").count("2 runs of earlier starts are no longer part of this sweep, because its file has changed") == 2
+        said("1").count(
+            "2 runs of earlier starts are no longer part of this sweep, because files that it reads have changed"
+        )
+        == 2
     )
     assert epo("sweep", "status", "mine") == 0
     out = capsys.readouterr().out

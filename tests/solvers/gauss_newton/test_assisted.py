@@ -137,7 +137,7 @@ def test_the_solver_takes_it_for_functions_of_single_steps():
 @pytest.mark.parametrize(
     ("own", "pair", "reason"),
     [
-        (["my acc"], [], "needs features that the compiled layer knows"),
+        (["my acc"], [], "needs a built-in feature beside those of the user"),
         (["acc", "whole"], [], r"does not know the feature 'whole'; it takes functions of single steps .*Source\.STEP"),
         (["acc", "my acc"], ["soft"], "does not know the pair feature 'soft'"),
     ],
@@ -177,6 +177,15 @@ def test_a_weight_that_alone_has_a_gradient():
         ).states
 
     assert torch.autograd.gradcheck(end, parameters.own_weights["drift"].clone().requires_grad_())
+
+
+def test_a_weight_of_all_modes_together_is_refused():
+    scene = random_scene(2, 1, history=2)
+    energy, parameters = coupled(scene, 6)
+    weights = parameters.own_weights | {"drift": parameters.own_weights["drift"][:, :1]}
+    game = dataclasses.replace(parameters, own_weights=weights)
+    with pytest.raises(ValueError, match=r"weights of the shape \[2, 1, 1\] for controls of \[2, 2, 1, 6, 2\]"):
+        assisted.solve(energy, scene, game, 1, 0.3, torch.ones(2, 2))
 
 
 def test_a_bad_weight_stops_its_own_game():
