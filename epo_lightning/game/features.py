@@ -182,7 +182,7 @@ class PairFeature:
 
 
 def _residuals(stepwise: bool) -> str:
-    """What a function of trajectories returns, in words."""
+    """Words for what a function of trajectories returns, in messages."""
     return "one residual per step, [.., K]" if stepwise else "residuals [.., R]; a single one is [.., 1]"
 
 

@@ -173,7 +173,7 @@ class Sweep:
 
     @property
     def former(self) -> list[RunFolder]:
-        """Runs of earlier starts that are no longer part of the sweep, because its file has changed since."""
+        """Runs of earlier starts that are no longer part of the sweep, because files that it reads have changed since."""
         return [RunFolder(path) for name in self.record.get("former", ()) if (path := self.root / name).exists()]
 
     def _job(self, file: Path, entry: Mapping[str, Any]) -> Job:

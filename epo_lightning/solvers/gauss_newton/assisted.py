@@ -12,6 +12,7 @@ phi = -<J mu, r + J d> has a part of the kernel's features and one of the user's
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -25,6 +26,7 @@ from epo_lightning.game.features import Source
 from epo_lightning.scene import Scene
 from epo_lightning.solvers.gauss_newton import compiled
 from epo_lightning.solvers.gauss_newton.kernel.interface import GIVEN
+from epo_lightning.solvers.gauss_newton.structured import pullback_undeclared
 
 _SOURCES = (Source.CONTROL, Source.SPEED, Source.STEP)
 """Sources of features with one residual per step, which depends on this step alone."""
@@ -142,22 +144,9 @@ class _Game:
             rows.append(torch.cat((value[None], by)).movedim(0, -1))
         return torch.stack(rows, -2)
 
-    def gradient_of_phi(
-        self, controls: Tensor, weights: list[Tensor], adjoint: Tensor, step: Tensor
-    ) -> tuple[Tensor, list[Tensor]]:
-        """The gradient of the user's part of phi by the controls and by the weights of the user's features."""
-        with torch.enable_grad():
-            controls = controls.detach().requires_grad_()
-            leaves = [weight.detach().requires_grad_() for weight in weights]
-            parameters = dataclasses.replace(
-                self.parameters, own_weights=dict(zip(self.custom.own, leaves, strict=True))
-            )
-            residuals, (along_adjoint, along_step) = self.custom.linearisation(
-                self.scene, parameters, controls, torch.stack((adjoint, step))
-            )
-            phi = -(along_adjoint * (residuals + along_step)).sum()
-            by_controls, *by = torch.autograd.grad(phi, [controls, *leaves], allow_unused=True, materialize_grads=True)
-        return by_controls, list(by)
+    def with_weights(self, weights: Sequence[Tensor]) -> GameParameters:
+        """The game's parameters with other weights of the user's features."""
+        return dataclasses.replace(self.parameters, own_weights=dict(zip(self.custom.own, weights, strict=True)))
 
 
 class _Step(torch.autograd.Function):
@@ -180,6 +169,7 @@ class _Step(torch.autograd.Function):
         gradients = call.differentiate(bar, None, None, adjoint)
         taken = call.status != Status.STOPPED
         step = torch.where(taken[..., None, None, None], call.directions[0], 0.0)
-        by_controls, by = game.gradient_of_phi(controls, tensors[: len(game.custom.own)], adjoint, step)
+        weights, directions = tensors[: len(game.custom.own)], torch.stack((adjoint, step))
+        by_controls, by = pullback_undeclared(game.custom, game.scene, game.with_weights, controls, weights, directions)
         bar = bar + torch.where(taken[..., None, None, None], by_controls, 0.0)
         return None, None, bar, *(torch.where(taken[..., None], one, 0.0) for one in by), *gradients

@@ -23,7 +23,7 @@ computed in closed form (:mod:`~epo_lightning.solvers.gauss_newton.pullback`).
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -160,7 +160,9 @@ class Game:
         ]
         if self.energy.undeclared is not None:
             directions = torch.stack([change.transpose(-1, -2).reshape(shape) for change in (adjoint, step)])
-            extra, rest = _pullback_undeclared(self, self.energy.undeclared, model.at.controls, tensors, directions)
+            extra, rest = pullback_undeclared(
+                self.energy.undeclared, self.scene, self.with_tensors, model.at.controls, tensors, directions
+            )
             by_controls = by_controls + extra
             by = [one + other for one, other in zip(by, rest, strict=True)]
         return by_controls, by
@@ -365,16 +367,28 @@ def _scatter(groups: Sequence[Group], parts: Sequence[Tensor], like: Float[Tenso
     return rows.view_as(like)
 
 
-def _pullback_undeclared(
-    game: Game, undeclared: FeatureEnergy, controls: Tensor, tensors: Sequence[Tensor], directions: Tensor
-) -> tuple[Tensor, list[Tensor]]:
-    """The gradient of phi for the undeclared features, by automatic differentiation."""
+def pullback_undeclared(
+    energy: FeatureEnergy,
+    scene: Scene,
+    with_tensors: Callable[[Sequence[Tensor]], GameParameters],
+    controls: Float[Tensor, "B M N K 2"],
+    tensors: Sequence[Tensor],
+    directions: Float[Tensor, "2 B M N K 2"],
+) -> tuple[Float[Tensor, "B M N K 2"], list[Tensor]]:
+    """The gradient of phi by the controls and by some tensors, by automatic differentiation.
+
+    Args:
+        energy: the features that count, such as the undeclared ones of a game.
+        scene: the scene.
+        with_tensors: function from tensors to the game's parameters with these tensors.
+        controls: the iterate.
+        tensors: the tensors by which the gradient is wanted.
+        directions: the adjoint mu and the step d.
+    """
     with torch.enable_grad():
         controls = controls.detach().requires_grad_()
         leaves = [tensor.detach().requires_grad_() for tensor in tensors]
-        residuals, (along_adjoint, along_step) = undeclared.linearisation(
-            game.scene, game.with_tensors(leaves), controls, directions
-        )
+        residuals, (along_adjoint, along_step) = energy.linearisation(scene, with_tensors(leaves), controls, directions)
         phi = -(along_adjoint * (residuals + along_step)).sum()
         by_controls, *by = torch.autograd.grad(phi, [controls, *leaves], allow_unused=True, materialize_grads=True)
     return by_controls, list(by)
