@@ -13,14 +13,13 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from epo_lightning.experiment.config.messages import one_sentence, refuse_merged, sentence
-from epo_lightning.experiment.config.sources import EXPERIMENTS, GROUP, file_of, options_of, recorded_name
-from epo_lightning.identity import canonical, essence, leaves, of_row
+from epo_lightning.experiment.config.replaced import keys_of_sweep, refuse_replaced, replaced
+from epo_lightning.experiment.config.sources import GROUP, file_of, options_of, recorded_name
+from epo_lightning.identity import canonical, essence, of_row
 from epo_lightning.registry import ConfigError, parts
-from epo_lightning.report.labels import value_text
-from epo_lightning.report.labels import word as override
 
 if TYPE_CHECKING:
     from hydra._internal.hydra import Hydra
@@ -120,9 +119,9 @@ def resolve(config: DictConfig) -> dict[str, Any]:
         if written is not None and choices.get("experiment"):
             values["title"] = _true_title(values, written)
         # A budget for trials is small whatever else is written.
-        if "hydra" in config and choices.get("budget") != "smoke" and (replaced := _replaced(words, search_path)):
-            of_sweep = _keys_of_sweep(choices.get(GROUP))
-            _refuse_replaced(values, [*config.hydra.overrides.task, *of_sweep], replaced)
+        if "hydra" in config and choices.get("budget") != "smoke" and (found := replaced(words, search_path)):
+            of_sweep = keys_of_sweep(choices.get(GROUP))
+            refuse_replaced(values, [*config.hydra.overrides.task, *of_sweep], found)
     return values
 
 
@@ -158,77 +157,6 @@ def _refuse_ignored(values: Mapping[str, Any], overrides: Iterable[str]) -> None
         f"{given[0].group()} has no effect on forecaster={name}, which takes no {part}: {there}; in a sweep over several "
         f"forecasters, write it into experiment files{how}"
     )
-
-
-def _refuse_replaced(values: Mapping[str, Any], overrides: Iterable[str], replaced: Sequence[_Replaced]) -> None:
-    """Refuse settings of the experiment's file that have no effect, because the budget's file replaces them.
-
-    Args:
-        values: the resolved configuration.
-        overrides: all overrides, and the keys of a sweep's file; such a key does not depend on the two files.
-        replaced: settings of the experiment's file to which the budget's file gives another value.
-
-    Raises:
-        ConfigError: the keys and values of both files, and where such a setting can stand.
-    """
-    final = dict(leaves(values))
-    given = {word.lstrip("+~").partition("=")[0] for word in overrides}
-    lost = [one for one in replaced if one.key not in given and final.get(one.key) == one.by]
-    if lost:
-        own = [f"{one.key}: {value_text(one.value)}" for one in lost]
-        others = [f"{one.key}: {value_text(one.by)}" for one in lost]
-        raise ConfigError(
-            f"{lost[0].file} sets {', '.join(own)} without effect: the budget's file {lost[0].budget} is read later and "
-            f"sets {', '.join(others)}; with this budget, move such settings to the command line "
-            f"({' '.join(override(one.key, one.value) for one in lost)}), to the file of a sweep, or to a budget of your own"
-        )
-
-
-def _keys_of_sweep(name: str | None) -> list[str]:
-    """The keys that the file of a sweep sets; none without a sweep."""
-    from hydra.core.global_hydra import GlobalHydra
-    from omegaconf import OmegaConf
-
-    loader: Any = GlobalHydra.instance().config_loader()
-    loaded = loader.repository.load_config(f"{GROUP}/{name}") if name else None
-    settings: Any = OmegaConf.to_container(loaded.config, resolve=False) if loaded else {}
-    return [key for key, _ in leaves(settings)]
-
-
-class _Replaced(NamedTuple):
-    """A setting of the file of an experiment to which the budget's file gives another value."""
-
-    key: str
-    value: Any
-    file: str
-    by: Any
-    budget: str
-
-
-@cache
-def _replaced(words: tuple[str, ...], search_path: tuple[str, ...]) -> list[_Replaced]:
-    """The settings of an experiment's file, and of the files it is based on, to which the budget gives another value."""
-    from hydra.core.global_hydra import GlobalHydra
-    from hydra.errors import HydraException
-    from hydra.types import RunMode
-    from omegaconf import OmegaConf
-
-    instance = GlobalHydra.instance().hydra
-    assert instance is not None
-    loader: Any = instance.config_loader
-    try:
-        entries = loader.compute_defaults_list("train", list(words), RunMode.RUN).defaults
-    except HydraException:  # the files need other overrides of the run
-        return []
-    found: dict[str, dict[str, tuple[Any, str]]] = {EXPERIMENTS: {}, "budget": {}}
-    for group, _, option in (str(entry.config_path).partition("/") for entry in entries):
-        loaded = loader.repository.load_config(f"{group}/{option}") if group in found else None
-        if loaded is not None:
-            settings: Any = OmegaConf.to_container(loaded.config, resolve=False)
-            file = file_of(instance, group, option)
-            found[group].update({key: (value, file) for key, value in leaves(settings)})
-    own, budget = found.values()
-    return [_Replaced(key, *own[key], *budget[key]) for key in own if key in budget and own[key][0] != budget[key][0]]
 
 
 def _true_title(values: Mapping[str, Any], written: Mapping[str, Any]) -> Any:
