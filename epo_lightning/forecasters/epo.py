@@ -56,8 +56,8 @@ from epo_lightning.task import Task
 EXAMINED = 512
 """Number of test scenes, spread evenly, in which the Nash gap is measured if this is slow.
 
-It is fast for energies of declared features and for solutions with tables of candidates; then it is measured in all
-scenes."""
+It is fast for energies of features, unless one is a function of whole trajectories, and for solutions with tables of
+candidates; then it is measured in all scenes."""
 
 
 @register("forecaster", "epo")
@@ -359,8 +359,8 @@ class EPO(Forecaster):
         """
         forecast = dataclasses.replace(forecast, states_without_pairs=self._states_without_pairs(scene, forecast))
         assert forecast.solution is not None
-        undeclared = isinstance(self.energy, FeatureEnergy) and self.energy.undeclared is not None
-        cheap = (FEATURES in self.energy.offers and not undeclared) or forecast.solution.tables is not None
+        slow = isinstance(self.energy, FeatureEnergy) and self.energy.of_trajectories
+        cheap = (FEATURES in self.energy.offers and not slow) or forecast.solution.tables is not None
         scenes = len(scene.history)
         stride = 1 if cheap else max(1, self._batches * scenes // EXAMINED)
         chosen = torch.arange(0, scenes, stride, device=scene.history.device)

@@ -338,12 +338,18 @@ def derivatives_of_steps(
 
     Arguments are those of :func:`undeclared_change`. The changes along any number of directions follow from these few.
     """
+    value, by = undeclared_change(function, at, unit_directions(at), *others)
+    return value, [part.movedim(0, -1) for part in by.split([tensor.shape[-1] for tensor in at])]
+
+
+def unit_directions(at: tuple[Tensor, Tensor]) -> tuple[Float[Tensor, "D *batch K _"], Float[Tensor, "D *batch K _"]]:
+    """Directions of two tensors that change one of the D numbers of all steps, which the two have together."""
     sizes = [tensor.shape[-1] for tensor in at]
     unit = torch.eye(sum(sizes), dtype=at[0].dtype, device=at[0].device)
-    unit = unit.view(-1, *[1] * (at[0].dim() - 1), sum(sizes)).expand(-1, *at[0].shape[:-1], -1)
-    first, second = unit.split(sizes, -1)
-    value, by = undeclared_change(function, at, (first, second), *others)
-    return value, [part.movedim(0, -1) for part in by.split(sizes)]
+    first, second = (
+        unit.view(-1, *[1] * (at[0].dim() - 1), sum(sizes)).expand(-1, *at[0].shape[:-1], -1).split(sizes, -1)
+    )
+    return first, second
 
 
 def stepwise_change(

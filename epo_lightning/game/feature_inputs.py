@@ -18,7 +18,7 @@ from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.energy import Energy
 from epo_lightning.game.feature_checks import check_bounds, check_features, check_margins, refuse_flaws
 from epo_lightning.game.feature_derivatives import Bounds, Surroundings
-from epo_lightning.game.features import OWN_FEATURES, PAIR_FEATURES, TARGETS, WHEELBASE, OwnFeature, PairFeature
+from epo_lightning.game.features import OWN_FEATURES, PAIR_FEATURES, TARGETS, WHEELBASE, OwnFeature, PairFeature, Source
 from epo_lightning.game.game_end import residual_mask
 from epo_lightning.game.limits import Bound, bounds_of_agents
 from epo_lightning.game.pairs import pair_mask, pairs
@@ -76,6 +76,17 @@ class FeatureInputs(Energy):
         """Names of the features that may depend on more than one time step, or on a state and a control together."""
         own = [name for name, feature in self.own_features.items() if not feature.stepwise]
         return [*own, *(name for name, pair in self.pair_features.items() if not (pair.declared or pair.stepwise))]
+
+    @cached_property
+    def sources(self) -> Sequence[tuple[str, Source]]:
+        """Name and source of every own feature, and then of every pair feature."""
+        own = [(name, feature.source) for name, feature in self.own_features.items()]
+        return own + [(name, feature.source) for name, feature in self.pair_features.items()]
+
+    @property
+    def of_trajectories(self) -> bool:
+        """Whether some feature is a function of whole trajectories, so that its derivatives are slow."""
+        return any(source is Source.TRAJECTORY for _, source in self.sources)
 
     @cached_property
     def needs(self) -> set[str]:

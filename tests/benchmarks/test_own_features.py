@@ -7,19 +7,20 @@ import re
 import pytest
 
 from benchmarks import own_features
-from epo_lightning.game.features import OWN_FEATURES
+from epo_lightning.game.features import OWN_FEATURES, PAIR_FEATURES
 
 
-def test_every_declaration_is_timed(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    known = {*OWN_FEATURES}
-    monkeypatch.setattr(own_features, "ROWS", ("rpi/v_lstm_epo",))
+def test_every_declaration_is_timed(capsys: pytest.CaptureFixture[str]) -> None:
+    known = {*OWN_FEATURES, *PAIR_FEATURES}
     try:
-        own_features.main(["--rounds", "1"])
+        own_features.main(["--rounds", "1", "--rows", "rpi/v_lstm_epo"])
     finally:
-        for name in {*OWN_FEATURES} - known:
-            del OWN_FEATURES[name]
+        for features in (OWN_FEATURES, PAIR_FEATURES):
+            for name in features.keys() - known:
+                del features[name]
     head, _, row = capsys.readouterr().out.splitlines()
-    assert re.findall(r"`Source\.(\w+)`", head) == ["SPEED", "STEP", "TRAJECTORY"]
+    named = ["own, SPEED", "own, STEP", "own, TRAJECTORY", "pair, DISTANCE", "pair, STEP", "pair, TRAJECTORY"]
+    assert re.findall(r"\+ (\w+, \w+)", head) == named
     times = [float(number) for number in re.findall(r"\d+\.\d", row)]
-    assert len(times) == 4
+    assert len(times) == 7
     assert min(times) > 0

@@ -264,14 +264,17 @@ def test_a_given_goal_is_told_to_the_network_if_asked_for_alone(config):
         assert torch.equal(forecaster.predict(scene).states, here) != told
 
 
-def test_nash_gaps_of_undeclared_features_are_measured_in_some_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nash_gaps_of_features_of_trajectories_are_measured_in_some_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Their derivatives are automatic, and all scenes of a test split would take minutes."""
     monkeypatch.setattr("epo_lightning.forecasters.epo.EXAMINED", 2)
     undeclared = features.OwnFeature(
         features.Source.TRAJECTORY, "sway", function=lambda states, controls: controls[..., 1]
     )
     monkeypatch.setitem(features.OWN_FEATURES, "sway", undeclared)
-    for own, measured in ((["goal", "acc", "turnr"], 4), (["goal", "acc", "turnr", "sway"], 2)):
+    turn = features.OwnFeature(features.Source.STEP, "turn", function=lambda states, controls: controls[..., 1])
+    monkeypatch.setitem(features.OWN_FEATURES, "turn", turn)
+    plain = ["goal", "acc", "turnr"]
+    for own, measured in ((plain, 4), ([*plain, "turn"], 4), ([*plain, "sway"], 2)):
         energy = {"name": "features", "own": own, "pair": ["proximity"]}
         forecaster = build_forecaster(model({"name": "epo", "modes": 2}, energy=energy)).eval()
         scene = random_scene(4, 2)

@@ -1,34 +1,37 @@
 """The compiled backend for energies with features of the user: PyTorch evaluates these, and the kernel takes the steps.
 
 In a Gauss-Newton step, a residual counts by its value and its derivatives at the present iterate alone. For features of
-single time steps (:attr:`~epo_lightning.game.features.Source.STEP`, or a declared control or speed) these are seven numbers
-per agent and time step. The kernel takes them as they are (``given`` in `kernel/game.hpp`), beside its own features. It is
-called once per Gauss-Newton step, because they change with the iterate.
+single time steps (:attr:`~epo_lightning.game.features.Source.STEP`, or a declared control, speed or distance) these are
+seven numbers per agent and time step, and nine per pair. The kernel takes them as they are (``given`` and ``given_pairs`` in
+`kernel/game.hpp`), beside its own features. It is called once per step, because they change with the iterate. Newton steps
+also take the second derivatives by the same numbers.
 
 The derivative of a step is that of :mod:`.structured`: with mu, the adjoint of the step, which the kernel returns,
-phi = -<J mu, r + J d> has a part of the kernel's features and one of the user's. PyTorch differentiates the latter.
+phi = -<J mu, r + J d> has a part of the kernel's features and one of the user's. PyTorch differentiates the latter. The
+derivative of a minimum (:mod:`.implicit`) is the same with the Hessian and d = 0.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from epo_lightning.forecast import GameParameters, Solution, Status
+from epo_lightning.game.feature_derivatives import unit_directions
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import Source
+from epo_lightning.game.pairs import pairs
 from epo_lightning.scene import Scene
 from epo_lightning.solvers.gauss_newton import compiled
-from epo_lightning.solvers.gauss_newton.kernel.interface import GIVEN
 from epo_lightning.solvers.gauss_newton.structured import pullback_undeclared
 
-_SOURCES = (Source.CONTROL, Source.SPEED, Source.STEP)
+_SOURCES = (Source.CONTROL, Source.SPEED, Source.STEP, Source.DISTANCE)
 """Sources of features with one residual per step, which depends on this step alone."""
 
 
@@ -37,10 +40,8 @@ def obstacle(energy: FeatureEnergy, scene: Scene, parameters: GameParameters) ->
     custom, known = energy.custom, energy.built_in
     if custom is None or known is None:
         return "the compiled layer needs a built-in feature beside those of the user, such as acc with a small weight"
-    if custom.pair:
-        return f"the compiled layer does not know the pair feature {custom.pair[0]!r}"
-    for name, feature in custom.own_features.items():
-        if feature.source not in _SOURCES:
+    for name, source in custom.sources:
+        if source not in _SOURCES:
             return (
                 f"the compiled layer does not know the feature {name!r}; it takes functions of single steps that are "
                 "declared as such (Source.STEP, docs/extend.md)"
@@ -58,22 +59,14 @@ def solve(
     keep_iterates: bool = False,
     exact: bool = False,
 ) -> Solution:
-    """S damped Gauss-Newton steps; arguments and solution are those of :func:`.structured.solve`.
+    """S damped steps; arguments and solution are those of :func:`.structured.solve`.
 
     Raises:
-        ValueError: weights that are not those of B scenes and M modes; or steps with the Hessian, which the kernel does not
-            get from PyTorch.
+        ValueError: weights that are not those of B scenes and M modes.
     """
-    if exact:
-        raise ValueError("steps with the Hessian need features that the kernel knows")
-    assert energy.custom is not None
-    assert energy.built_in is not None
-    game = _Game(energy.custom, energy.built_in, scene, parameters, step_size, damping)
-    wrong = [list(weight.shape) for weight in game.weights if weight.shape[:2] != parameters.initial_controls.shape[:2]]
-    if wrong:
-        raise ValueError(f"weights of the shape {wrong[0]} for controls of {list(parameters.initial_controls.shape)}")
+    game = _Game.of(energy, scene, parameters, step_size, damping, exact)
     controls = torch.where(scene.agent_mask[:, None, :, None, None], parameters.initial_controls, 0.0)
-    status = torch.full(controls.shape[:2], Status.SOLVED)
+    status = torch.where(game.custom.finite(scene, parameters), Status.SOLVED, Status.STOPPED)
     iterates, initial_energy = [controls], None
     for _ in range(steps):
         call = game.call(controls, 1)
@@ -99,9 +92,23 @@ def solve(
     )
 
 
+def attach(
+    energy: FeatureEnergy, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"], exact: bool
+) -> tuple[Float[Tensor, "B M N K 2"], Int[Tensor, "B M"]]:
+    """The controls of a solution with their implicit derivative, and a status; see :func:`.implicit.attach`.
+
+    As in :func:`.compiled.attach`, the factors are those of one undamped step from the solution, in float64.
+    """
+    start, none = controls.double(), controls.new_zeros(controls.shape[:2], dtype=torch.float64)
+    game = _Game.of(energy, scene.to(torch.float64), parameters.to(torch.float64), 1.0, none, exact)
+    call = game.call(start, 1)
+    found, status = _Minimum.apply(game, call, start, *game.weights, *call.inputs)
+    return found.to(controls.dtype), status
+
+
 @dataclasses.dataclass(frozen=True)
 class _Game:
-    """A game in two parts, the user's features and the kernel's, with the step size and the damping of its steps."""
+    """A game in two parts, the user's features and the kernel's, with the step size, damping and kind of its steps."""
 
     custom: FeatureEnergy
     built_in: FeatureEnergy
@@ -109,11 +116,38 @@ class _Game:
     parameters: GameParameters
     step_size: float
     damping: Tensor
+    exact: bool
+
+    @classmethod
+    def of(
+        cls,
+        energy: FeatureEnergy,
+        scene: Scene,
+        parameters: GameParameters,
+        step_size: float,
+        damping: Tensor,
+        exact: bool,
+    ) -> _Game:
+        """The parts of a game.
+
+        Raises:
+            ValueError: weights that are not those of B scenes and M modes.
+        """
+        assert energy.custom is not None
+        assert energy.built_in is not None
+        game = cls(energy.custom, energy.built_in, scene, parameters, step_size, damping, exact)
+        shape = parameters.initial_controls.shape
+        wrong = [list(weight.shape) for weight in game.weights if weight.shape[:2] != shape[:2]]
+        if wrong:
+            raise ValueError(f"weights of the shape {wrong[0]} for controls of {list(shape)}")
+        return game
 
     @property
     def weights(self) -> list[Tensor]:
-        """The weights of the user's features."""
-        return [self.parameters.own_weights[name] for name in self.custom.own]
+        """The weights of the user's features, and the margins of pairs."""
+        own, pair, margins = self.parameters.own_weights, self.parameters.pair_weights, self.parameters.margins
+        names = self.custom.own, self.custom.pair, self.custom.decoded_margins
+        return [of[name] for of, some in zip((own, pair, margins), names, strict=True) for name in some]
 
     def call(self, controls: Float[Tensor, "B M N K 2"], steps: int) -> compiled.Call:
         """A call of the kernel that takes one step from ``controls``, or none, which evaluates them."""
@@ -126,27 +160,81 @@ class _Game:
             self.step_size,
             self.damping,
             keep_iterates=False,
-            given=self._given(controls),
+            exact=self.exact,
+            given=self._given(controls, curved=self.exact and steps > 0),
             beside=self.weights,
         )
 
     @torch.no_grad()
-    def _given(self, controls: Tensor) -> Float[Tensor, "B M N K R 7"]:
-        """Weighted residuals of the user's features, with their derivatives by states and controls."""
-        custom, scene = self.custom, self.scene
-        around = custom.surroundings(scene, self.parameters)
-        states = custom.dynamics.rollout(custom.current_states(scene), controls, scene.dt)
-        unit = torch.eye(GIVEN - 1, dtype=controls.dtype)[:, None, None, None, None]
-        moved = unit[..., :4].expand(-1, *states.shape), unit[..., 4:].expand(-1, *controls.shape)
-        rows = []
-        for name in custom.own:
-            value, by = custom.own_residual(name, scene, self.parameters, around, (states, controls), moved)
-            rows.append(torch.cat((value[None], by)).movedim(0, -1))
-        return torch.stack(rows, -2)
+    def _given(self, controls: Float[Tensor, "B M N K 2"], curved: bool) -> compiled.Given:
+        """Weighted residuals of the user's features with their derivatives, of second order as well if ``curved``."""
+        states = self.custom.dynamics.rollout(self.custom.current_states(self.scene), controls, self.scene.dt)
+        first, second = pairs(states.shape[2], states.device)
+        at, both = (states, controls), (states[:, :, first], states[:, :, second])
+        own = _rows(self._own(at, unit_directions(at)))
+        pair = _rows(self._pair(both, unit_directions(both)))
+        if not curved:
+            return compiled.Given(own, pair)
+        by_both = None if pair is None else _curvature(self._pair, both)
+        return compiled.Given(
+            own,
+            pair,
+            None if own is None else _curvature(self._own, at),
+            None if by_both is None else self.custom.at_pair_steps(by_both),
+        )
+
+    def _own(self, at: tuple[Tensor, Tensor], moved: tuple[Tensor, Tensor]) -> list[tuple[Tensor, Tensor]]:
+        """Residuals of the user's own features, with their changes along directions."""
+        custom, scene, game = self.custom, self.scene, self.parameters
+        around = custom.surroundings(scene, game)
+        return [custom.own_residual(name, scene, game, around, at, moved) for name in custom.own]
+
+    def _pair(self, both: tuple[Tensor, Tensor], moved: tuple[Tensor, Tensor]) -> list[tuple[Tensor, Tensor]]:
+        """The same for the user's pair features."""
+        found = self.custom.pair_residuals(self.scene, self.parameters, both, moved)
+        return [(residual, change) for _, residual, change in found]
 
     def with_weights(self, weights: Sequence[Tensor]) -> GameParameters:
-        """The game's parameters with other weights of the user's features."""
-        return dataclasses.replace(self.parameters, own_weights=dict(zip(self.custom.own, weights, strict=True)))
+        """The game's parameters with other weights and margins of the user's features."""
+        names, values = (self.custom.own, self.custom.pair, self.custom.decoded_margins), iter(weights)
+        own, pair, margins = ({name: next(values) for name in some} for some in names)
+        return dataclasses.replace(self.parameters, own_weights=own, pair_weights=pair, margins=margins)
+
+    def gradient_of_phi(
+        self, controls: Tensor, tensors: Sequence[Tensor], adjoint: Tensor, step: Tensor
+    ) -> tuple[Tensor, list[Tensor]]:
+        """The part of the user's features in the gradient of phi, by the controls and by the first tensors, the weights."""
+        weights, directions = tensors[: len(self.weights)], torch.stack((adjoint, step))
+        return pullback_undeclared(self.custom, self.scene, self.with_weights, controls, weights, directions)
+
+
+def _rows(found: Sequence[tuple[Tensor, Tensor]]) -> Float[Tensor, "*batch R D"] | None:
+    """Residuals [.., K] of R features with their derivatives [D - 1, .., K] in the kernel's order; None for no features."""
+    if not found:
+        return None
+    return torch.stack([torch.cat((value[None], by)).movedim(0, -1) for value, by in found], -2)
+
+
+def _curvature(
+    residuals: Callable[[tuple[Tensor, Tensor], tuple[Tensor, Tensor]], list[tuple[Tensor, Tensor]]],
+    at: tuple[Tensor, Tensor],
+) -> Float[Tensor, "*batch K E"]:
+    """The sums of r d2r over residuals of single steps, by the numbers of each step in two tensors: lower triangles."""
+    with torch.enable_grad():
+        at = (at[0].detach().requires_grad_(), at[1].detach().requires_grad_())
+        still = at[0].new_zeros(0, *at[0].shape), at[1].new_zeros(0, *at[1].shape)
+        half = torch.stack([(value.detach() * value).sum() for value, _ in residuals(at, still)]).sum()
+        slope = _gradients(half, at)
+        rows = [_gradients(by.sum(), at) for by in slope.unbind(-1)]
+    below = torch.tril_indices(len(rows), len(rows))
+    return torch.stack(rows, -2)[..., below[0], below[1]]
+
+
+def _gradients(value: Tensor, by: tuple[Tensor, Tensor]) -> Float[Tensor, "*batch K D"]:
+    """Gradients of a scalar by two tensors, side by side; zero where it depends on neither."""
+    if not value.requires_grad:
+        return torch.cat([torch.zeros_like(one) for one in by], -1)
+    return torch.cat(torch.autograd.grad(value, by, create_graph=True, materialize_grads=True), -1)
 
 
 class _Step(torch.autograd.Function):
@@ -169,7 +257,33 @@ class _Step(torch.autograd.Function):
         gradients = call.differentiate(bar, None, None, adjoint)
         taken = call.status != Status.STOPPED
         step = torch.where(taken[..., None, None, None], call.directions[0], 0.0)
-        weights, directions = tensors[: len(game.custom.own)], torch.stack((adjoint, step))
-        by_controls, by = pullback_undeclared(game.custom, game.scene, game.with_weights, controls, weights, directions)
+        by_controls, by = game.gradient_of_phi(controls, tensors, adjoint, step)
         bar = bar + torch.where(taken[..., None, None, None], by_controls, 0.0)
         return None, None, bar, *(torch.where(taken[..., None], one, 0.0) for one in by), *gradients
+
+
+class _Minimum(torch.autograd.Function):
+    """Autograd function of the implicit derivative; returns the given controls and a status."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, game: _Game, call: compiled.Call, controls: Tensor, *tensors: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        call.run()
+        after = game.call(call.iterates[-1], 0)
+        after.run()
+        status = compiled.prepare_minimum(call, after.energy)
+        ctx.game, ctx.call, ctx.definite = game, call, status != Status.STOPPED
+        ctx.save_for_backward(controls, *tensors, *call.kept, *game.scene.tensors())
+        ctx.mark_non_differentiable(status)
+        return controls.view_as(controls), status
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, cotangent: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
+        controls, *tensors = ctx.saved_tensors
+        bar = torch.where(ctx.definite[..., None, None, None], cotangent, 0.0).contiguous()
+        adjoint, still = torch.zeros_like(bar), torch.zeros_like(bar)
+        gradients = ctx.call.differentiate(bar, None, None, adjoint)
+        _, by = ctx.game.gradient_of_phi(controls, tensors, adjoint, still)
+        return None, None, None, *(torch.where(ctx.definite[..., None], one, 0.0) for one in by), *gradients

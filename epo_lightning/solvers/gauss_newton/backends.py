@@ -47,8 +47,18 @@ class Backend(Protocol):
 
 
 @runtime_checkable
-class KernelBackend(Backend, Protocol):
-    """A module whose kernel also takes all adaptive steps in one call, and differentiates minima."""
+class DifferentiatingBackend(Backend, Protocol):
+    """A module whose kernel also differentiates minima."""
+
+    def attach(
+        self, energy: FeatureEnergy, scene: Scene, parameters: GameParameters, controls: Tensor, exact: bool
+    ) -> tuple[Tensor, Tensor]:
+        """The controls of a solution with their implicit derivative, and a status."""
+
+
+@runtime_checkable
+class DescendingBackend(Backend, Protocol):
+    """A module whose kernel also takes all adaptive steps in one call."""
 
     def descend(
         self,
@@ -62,15 +72,15 @@ class KernelBackend(Backend, Protocol):
     ) -> tuple[Solution, Tensor]:
         """S adaptive steps without a derivative; returns the solution and the damping to continue with."""
 
-    def attach(
-        self, energy: FeatureEnergy, scene: Scene, parameters: GameParameters, controls: Tensor, exact: bool
-    ) -> tuple[Tensor, Tensor]:
-        """The controls of a solution with their implicit derivative, and a status."""
 
-
-def with_kernel(backend: Backend) -> KernelBackend | None:
-    """The backend, if it is one whose kernel takes adaptive steps."""
+def descending(backend: Backend) -> DescendingBackend | None:
+    """The backend, if its kernel takes all adaptive steps in one call."""
     return next((one for one in (compiled, hosted) if one is backend), None)
+
+
+def differentiating(backend: Backend) -> DifferentiatingBackend | None:
+    """The backend, if its kernel differentiates minima."""
+    return next((one for one in (compiled, hosted, assisted) if one is backend), None)
 
 
 def choose(
@@ -79,7 +89,6 @@ def choose(
     scene: Scene,
     parameters: GameParameters,
     fixed: bool = False,
-    exact: bool = False,
 ) -> Backend:
     """The backend for a game.
 
@@ -89,7 +98,6 @@ def choose(
             different times, of which only the host makes use. Where neither can solve the game, it is ``pytorch``.
         energy, scene, parameters: the game.
         fixed: whether all steps are Gauss-Newton steps with the same damping.
-        exact: whether the Hessian is needed, for Newton steps or an implicit derivative.
 
     Raises:
         ValueError: the backend of this name cannot solve the game.
@@ -104,7 +112,7 @@ def choose(
     obstacle = chosen.obstacle(energy, scene, parameters)
     if obstacle is None:
         return chosen
-    if chosen is compiled and energy.custom is not None and not exact:
+    if chosen is compiled and energy.custom is not None:
         obstacle = assisted.obstacle(energy, scene, parameters)
         if obstacle is None:
             return assisted

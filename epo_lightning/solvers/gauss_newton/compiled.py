@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -27,7 +27,7 @@ from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import Scene
 from epo_lightning.solvers.gauss_newton.game_arrays import GameArrays, as_type
 from epo_lightning.solvers.gauss_newton.kernel import interface
-from epo_lightning.solvers.gauss_newton.kernel.interface import MOST_AGENTS, OWN, PAIR, Address, EpoRun
+from epo_lightning.solvers.gauss_newton.kernel.interface import MOST_AGENTS, OWN, PAIR, Address, EpoGame, EpoRun
 from epo_lightning.solvers.gauss_newton.recorded_steps import take_steps
 from epo_lightning.solvers.general import descent
 
@@ -147,6 +147,39 @@ class _Tape:
             self._release(self.address)
 
 
+class Given(NamedTuple):
+    """Weighted residuals r of features that the kernel does not know.
+
+    Attributes:
+        own: residuals of single steps, each with its derivatives by x, y, heading and speed after the step and by the
+            acceleration and the turn rate of the step.
+        pair: residuals of pairs at the evaluated steps L, each with its derivatives by the states of both agents.
+        own_curvature: the sums of r d2r over the own residuals of a step, entries below and on the diagonal; None for steps
+            without the Hessian.
+        pair_curvature: the same for pairs.
+    """
+
+    own: Float[Tensor, "B M N K _ 7"] | None
+    pair: Float[Tensor, "B M P L _ 9"] | None
+    own_curvature: Float[Tensor, "B M N K 21"] | None = None
+    pair_curvature: Float[Tensor, "B M P L 36"] | None = None
+
+    def held(self, dtype: torch.dtype) -> Given:
+        """The same numbers as the kernel reads them: contiguous tensors of a type."""
+        return Given(*(None if one is None else as_type(dtype, one).contiguous() for one in self))
+
+    def describe(self, game: EpoGame) -> None:
+        """Write the addresses of the tensors to the structure of a game."""
+        if self.own is not None:
+            game.given, game.given_count = self.own.data_ptr(), self.own.shape[-2]
+        if self.pair is not None:
+            game.given_pairs, game.given_pair_count = self.pair.data_ptr(), self.pair.shape[-2]
+        if self.own_curvature is not None:
+            game.given_curvature = self.own_curvature.data_ptr()
+        if self.pair_curvature is not None:
+            game.given_pair_curvature = self.pair_curvature.data_ptr()
+
+
 class Call:
     """One call of the kernel: its arguments as C structures, the arrays behind them, and its results."""
 
@@ -162,7 +195,7 @@ class Call:
         exact: bool = False,
         adaptive: bool = False,
         threads: int | None = None,
-        given: Tensor | None = None,
+        given: Given | None = None,
         beside: Sequence[Tensor] = (),
     ) -> None:
         """Collect the arguments.
@@ -170,8 +203,8 @@ class Call:
         Args:
             energy, scene, parameters, steps, step_size, damping, keep_iterates, exact, threads: those of :func:`solve`.
             adaptive: whether the steps are adaptive (:func:`descend`).
-            given: residuals that the kernel takes as they are (``given`` in `kernel/game.hpp`). The energy of the last
-                iterate is not computed then, because it has other residuals.
+            given: residuals that the kernel takes as they are. The energy of the last iterate is not computed then, because
+                it has other residuals.
             beside: tensors besides ``inputs`` by which the caller differentiates the steps.
         """
         controls = parameters.initial_controls
@@ -182,9 +215,9 @@ class Call:
         self.arrays = GameArrays(energy, scene, parameters, controls)
         self.game, self.inputs, self.kept = self.arrays.game, self.arrays.inputs, self.arrays.kept
         self.record = torch.is_grad_enabled() and any(x.requires_grad for x in (controls, *self.inputs, *beside))
-        self.given = None if given is None else as_type(controls.dtype, given).contiguous()
+        self.given = None if given is None else given.held(controls.dtype)
         if self.given is not None:
-            self.game.given, self.game.given_count = self.given.data_ptr(), self.given.shape[-2]
+            self.given.describe(self.game)
         self.tape = _Tape()
         self._reserve(step_size, damping)
 
@@ -257,9 +290,7 @@ class _Minimum(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, call: Call, controls: Tensor, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         call.run()
-        status = _definite(call)
-        descent.warn_if_far(call.initial_energy, (call.initial_energy - call.energy).abs(), status != Status.STOPPED)
-        call.directions.zero_()
+        status = prepare_minimum(call, call.energy)
         call.states = None
         ctx.call, ctx.definite = call, status != Status.STOPPED
         ctx.save_for_backward(*inputs, *call.kept)
@@ -277,3 +308,14 @@ class _Minimum(torch.autograd.Function):
 def _definite(call: Call) -> Tensor:
     """STOPPED for problems whose matrix was not positive definite without damping."""
     return torch.where(call.status == Status.SOLVED, Status.SOLVED, Status.STOPPED)
+
+
+def prepare_minimum(call: Call, after: Float[Tensor, "B M"]) -> Int[Tensor, "B M"]:
+    """The status of minima, after a call that took one undamped step from them; ``after`` is the energy after the step.
+
+    The call then has the adjoint of a step of length zero. Warns of games that the step has moved far.
+    """
+    status = _definite(call)
+    descent.warn_if_far(call.initial_energy, (call.initial_energy - after).abs(), status != Status.STOPPED)
+    call.directions.zero_()
+    return status

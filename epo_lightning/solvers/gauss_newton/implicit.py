@@ -44,10 +44,8 @@ def attach(
         controls, and a :class:`~epo_lightning.forecast.Status`: STOPPED where H is not positive definite, so that the
         controls are no minimum; such a problem has a gradient of zero.
     """
-    chosen = backends.choose(
-        backend, energy, scene, dataclasses.replace(parameters, initial_controls=controls), exact=True
-    )
-    kernel = backends.with_kernel(chosen)
+    chosen = backends.choose(backend, energy, scene, dataclasses.replace(parameters, initial_controls=controls))
+    kernel = backends.differentiating(chosen)
     if kernel is not None:
         return kernel.attach(energy, scene, parameters, controls, exact)
     none = controls.new_zeros(controls.shape[:2]).flatten()

@@ -175,10 +175,10 @@ class LevenbergMarquardt(Stepwise):
         if start.numel() == 0:
             return descent.nothing(start), damping
         fixed = not self.adaptive and not exact
-        backend, size = backends.choose(self.backend, energy, scene, parameters, fixed, exact), self.step_size
+        backend, size = backends.choose(self.backend, energy, scene, parameters, fixed), self.step_size
         if not self.adaptive:
             return backend.solve(energy, scene, parameters, steps, size, damping, self.keep_iterates, exact), damping
-        kernel = backends.with_kernel(backend)
+        kernel = backends.descending(backend)
         if kernel is not None and not torch.is_grad_enabled() and not self.keep_iterates:
             return kernel.descend(energy, scene, parameters, steps, size, damping, exact)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+from collections.abc import Mapping
 
 import pytest
 import torch
@@ -16,16 +17,21 @@ from epo_lightning.forecast import GameParameters, Status
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import OWN_FEATURES, PAIR_FEATURES, Source, own_feature, pair_feature
 from epo_lightning.scene import ACCELERATION, HEADING, SPEED, TURN_RATE, Scene, X, Y
-from epo_lightning.solvers.gauss_newton import assisted, backends, compiled, structured
+from epo_lightning.solvers.gauss_newton import assisted, backends, compiled, implicit, structured
 from epo_lightning.solvers.gauss_newton.kernel import interface
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
+from epo_lightning.solvers.general import dense
+from epo_lightning.solvers.general.dense import hessian
 
 if isinstance(interface.find(), str) and shutil.which("c++") is None:
     pytest.skip("there is no C++ compiler on this machine, so the kernel was not built", allow_module_level=True)
 
 TWINS = {"acc": "my acc", "vel": "my vel", "turnr": "my turnr"}
-"""Built-in features, and the same as functions of the user."""
+"""Built-in own features, and the same as functions of the user."""
+PAIR_TWINS = {name: f"my {name}" for name in ("proximity", "clearance", "circles", "headway")}
+"""The same for pairs."""
 COUPLED = ("drift", "hurry", "detour")
+COUPLED_PAIRS = ("soft", "drawn apart", "room")
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -46,19 +52,47 @@ def features():
     def detour(states, controls):
         return 0.2 * states[..., X] * states[..., Y] + controls[..., TURN_RATE] * controls[..., ACCELERATION]
 
-    own_feature("whole")(lambda states, controls: states[..., SPEED].diff(dim=-1))
+    pair_feature("my proximity", Source.DISTANCE)(PAIR_FEATURES["proximity"].function)
+    pair_feature("my clearance", Source.DISTANCE, margin=True)(PAIR_FEATURES["clearance"].function)
+    pair_feature("my circles", Source.STEP, needs="size")(PAIR_FEATURES["circles"].function)
+    pair_feature("my headway", Source.STEP, needs="size", margin=True)(PAIR_FEATURES["headway"].function)
     pair_feature("soft", Source.DISTANCE)(lambda distance, reach: (reach - distance).exp())
+
+    @pair_feature("drawn apart", Source.STEP)
+    def drawn_apart(one, other):
+        """Of any range, and of the other sign if the agents are swapped."""
+        ahead = one[..., SPEED] * one[..., HEADING].cos() - other[..., SPEED] * other[..., HEADING].cos()
+        return 0.2 * ahead + 0.1 * (one[..., X] - other[..., X]) * (one[..., Y] + other[..., Y])
+
+    @pair_feature("room", Source.STEP, needs="size", margin=True)
+    def room(one, other, size, other_size, margin):
+        """Of a short range."""
+        away = (one[..., :2] - other[..., :2]).square().sum(-1)
+        return ((size + other_size).sum(-1) + margin - away).relu() * (1.0 + one[..., SPEED] + other[..., SPEED])
+
+    own_feature("whole")(lambda states, controls: states[..., SPEED].diff(dim=-1))
+    pair_feature("whole pair")(lambda one, other: one[..., SPEED].diff(dim=-1) - other[..., SPEED].diff(dim=-1))
     yield
     for name in (*TWINS.values(), *COUPLED, "whole"):
         del OWN_FEATURES[name]
-    del PAIR_FEATURES["soft"]
+    for name in (*PAIR_TWINS.values(), *COUPLED_PAIRS, "whole pair"):
+        del PAIR_FEATURES[name]
+
+
+def exchanged(named: Mapping[str, torch.Tensor], twins: Mapping[str, str]) -> dict[str, torch.Tensor]:
+    return {twins.get(name, name): tensor for name, tensor in named.items()}
 
 
 def with_twins(energy, scene, parameters, *given, **options):
     """The solution of a game whose features were exchanged for their twins."""
-    own = [TWINS.get(name, name) for name in energy.own]
-    renamed = {TWINS.get(name, name): weight for name, weight in parameters.own_weights.items()}
-    energy, parameters = dataclasses.replace(energy, own=own), dataclasses.replace(parameters, own_weights=renamed)
+    own, pair = [TWINS.get(name, name) for name in energy.own], [PAIR_TWINS.get(name, name) for name in energy.pair]
+    energy = dataclasses.replace(energy, own=own, pair=pair, margins=exchanged(energy.margins, PAIR_TWINS))
+    parameters = dataclasses.replace(
+        parameters,
+        own_weights=exchanged(parameters.own_weights, TWINS),
+        pair_weights=exchanged(parameters.pair_weights, PAIR_TWINS),
+        margins=exchanged(parameters.margins, PAIR_TWINS),
+    )
     helped = assisted.obstacle(energy, scene, parameters) is None
     return (assisted if helped else structured).solve(energy, scene, parameters, *given, **options)
 
@@ -67,31 +101,46 @@ class TestAssisted(BackendSuite):
     solve = staticmethod(with_twins)
 
 
+def small_scene(agents: int, ends: tuple[int, int] | None) -> Scene:
+    """Two scenes; in the second one, the second agent is absent."""
+    scene = random_scene(2, agents, history=2, size=1.0, dtype=torch.float64)
+    scene.agent_mask[1, 1:2] = False
+    return scene if ends is None else dataclasses.replace(scene, game_steps=torch.tensor(ends))
+
+
 def coupled(
-    scene: Scene, horizon: int, own: tuple[str, ...] = ("acc", "goal"), **settings: object
+    scene: Scene,
+    horizon: int,
+    own: tuple[str, ...] = ("acc", "goal", *COUPLED),
+    pair: tuple[str, ...] = (),
+    **settings: object,
 ) -> tuple[FeatureEnergy, GameParameters]:
-    game = random_game(scene, 2, horizon)
+    game = random_game(scene, 2, horizon, pair=pair)
     weights = game.own_weights | {name: 0.2 + torch.rand_like(game.own_weights["acc"]) for name in COUPLED}
-    return FeatureEnergy([*own, *COUPLED], bounds=BOUNDS, **settings), dataclasses.replace(game, own_weights=weights)
+    return FeatureEnergy(own, pair, BOUNDS, **settings), dataclasses.replace(game, own_weights=weights)
 
 
-@settings(max_examples=25)
+@settings(max_examples=40)
 @given(
     agents=st.integers(1, 4),
     horizon=st.integers(2, 12),
     own=st.sampled_from([("acc",), ("goal", "steer", "jerk", "lane"), ("turnacc", "velb", "heading")]),
+    pair=st.sampled_from([(), COUPLED_PAIRS, ("proximity", "drawn apart"), ("room",), ("soft", "longitudinal")]),
+    both=st.booleans(),
+    fixed=st.booleans(),
     stride=st.sampled_from([1, 2]),
     ends=st.none() | st.tuples(st.integers(1, 12), st.integers(1, 12)),
     steps=st.integers(1, 3),
     seed=st.integers(0, 10_000),
 )
-def test_features_that_couple_states_and_controls_equal_the_reference(agents, horizon, own, stride, ends, steps, seed):
+def test_features_that_couple_states_and_controls_equal_the_reference(
+    agents, horizon, own, pair, both, fixed, stride, ends, steps, seed
+):
     torch.manual_seed(seed)
-    scene = random_scene(2, agents, history=2, size=1.0, dtype=torch.float64)
-    scene.agent_mask[1, 1:2] = False
-    if ends is not None:
-        scene = dataclasses.replace(scene, game_steps=torch.tensor(ends).clamp_max(horizon))
-    energy, parameters = coupled(scene, horizon, own, pair_stride=stride)
+    scene = small_scene(agents, None if ends is None else (min(ends[0], horizon), min(ends[1], horizon)))
+    margins = {"room": 0.7} if fixed and "room" in pair else {}
+    own = (*own, *COUPLED) if both or not pair else own
+    energy, parameters = coupled(scene, horizon, own, pair, pair_stride=stride, margins=margins)
     damping = torch.full((2, 2), 3.0, dtype=torch.float64)
     ours, theirs = leaves_of(parameters), leaves_of(parameters)
     solution = assisted.solve(energy, scene, ours, steps, 0.5, damping, keep_iterates=True)
@@ -120,6 +169,62 @@ def test_features_that_couple_states_and_controls_equal_the_reference(agents, ho
         torch.testing.assert_close(gradient / scale, exact[name] / scale, rtol=0, atol=1e-9, msg=name)
 
 
+@settings(max_examples=25)
+@given(
+    agents=st.integers(1, 3),
+    pair=st.sampled_from([(), COUPLED_PAIRS, ("proximity", "drawn apart")]),
+    own=st.sampled_from([COUPLED, ("hurry",), ()]),
+    stride=st.sampled_from([1, 2]),
+    ends=st.none() | st.tuples(st.integers(2, 6), st.integers(2, 6)),
+    seed=st.integers(0, 10_000),
+)
+def test_newton_steps_equal_those_of_a_dense_hessian(agents, pair, own, stride, ends, seed):
+    torch.manual_seed(seed)
+    scene = small_scene(agents, ends)
+    energy, parameters = coupled(
+        scene, 6, ("acc", "goal", *(own if own or pair else COUPLED)), pair, pair_stride=stride
+    )
+    damping = torch.full((2, 2), 300.0, dtype=torch.float64)
+    found = assisted.solve(energy, scene, parameters, 1, 0.7, damping, exact=True)
+    assert (found.status == Status.SOLVED).all()
+    start = parameters.initial_controls
+    matrix = hessian(energy, scene, parameters, start) + 300.0 * torch.eye(start[0, 0].numel(), dtype=torch.float64)
+    leaf = start.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(energy(scene, parameters, leaf).sum(), leaf)
+    step = torch.linalg.solve(matrix, slope.flatten(2)[..., None]).view_as(start)
+    expected = torch.where(scene.agent_mask[:, None, :, None, None], start - 0.7 * step, 0.0)
+    torch.testing.assert_close(found.controls, expected, rtol=0, atol=1e-9)
+
+
+@settings(max_examples=15)
+@given(
+    agents=st.integers(1, 3),
+    pair=st.sampled_from([(), COUPLED_PAIRS, ("proximity", "drawn apart")]),
+    exact=st.booleans(),
+    ends=st.none() | st.tuples(st.integers(2, 6), st.integers(2, 6)),
+    seed=st.integers(0, 10_000),
+)
+def test_derivatives_of_minima_equal_those_of_dense_matrices(agents, pair, exact, ends, seed):
+    torch.manual_seed(seed)
+    scene = small_scene(agents, ends)
+    energy, parameters = coupled(scene, 6, ("acc", "turnr", "goal", *COUPLED), pair)
+    solver = LevenbergMarquardt(steps=10, newton_steps=30, step_size=1.0, damping=1.0, adaptive=True)
+    with torch.no_grad():
+        minimum = solver(energy, scene, parameters)
+    assert minimum.gradient_norm.max() < 1e-6
+    weigh = torch.randn_like(minimum.controls)
+    found = []
+    for attach in (implicit.attach, dense.attach):
+        leaves = leaves_of(parameters)
+        controls, status = attach(energy, scene, leaves, minimum.controls, exact)
+        assert torch.equal(controls.detach(), minimum.controls)
+        (controls * weigh).sum().backward()
+        found.append((status, gradients(leaves)))
+    assert torch.equal(found[0][0], found[1][0])
+    for name, gradient in found[0][1].items():
+        torch.testing.assert_close(gradient, found[1][1][name], rtol=1e-6, atol=1e-8, msg=name)
+
+
 def test_the_solver_takes_it_for_functions_of_single_steps():
     scene = random_scene(3, 2, history=2)
     energy, parameters = coupled(scene, 8)
@@ -127,8 +232,6 @@ def test_the_solver_takes_it_for_functions_of_single_steps():
     assert backends.choose("compiled", energy, scene, parameters) is assisted
     assert backends.choose("pytorch", energy, scene, parameters) is structured
     assert backends.choose("auto", FeatureEnergy(["acc"]), scene, parameters) is compiled
-    with pytest.warns(UserWarning, match="Plain PyTorch does the same"):
-        assert backends.choose("auto", energy, scene, parameters, exact=True) is structured
     found, plain = (LevenbergMarquardt(backend=name)(energy, scene, parameters) for name in ("auto", "pytorch"))
     assert found.controls.dtype == torch.float32
     torch.testing.assert_close(found.controls, plain.controls, rtol=0, atol=5e-5)
@@ -139,7 +242,7 @@ def test_the_solver_takes_it_for_functions_of_single_steps():
     [
         (["my acc"], [], "needs a built-in feature beside those of the user"),
         (["acc", "whole"], [], r"does not know the feature 'whole'; it takes functions of single steps .*Source\.STEP"),
-        (["acc", "my acc"], ["soft"], "does not know the pair feature 'soft'"),
+        (["acc", "my acc"], ["soft", "whole pair"], "does not know the feature 'whole pair'"),
     ],
 )
 def test_games_that_it_cannot_solve_have_a_reason(own, pair, reason):

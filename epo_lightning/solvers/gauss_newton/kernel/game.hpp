@@ -26,6 +26,14 @@ enum Status { SOLVED, DAMPED, STOPPED };
 /// acceleration and the turn rate of the step.
 enum Given { GIVEN_VALUE, GIVEN_X, GIVEN_Y, GIVEN_HEADING, GIVEN_SPEED, GIVEN_ACCELERATION, GIVEN_TURN_RATE, GIVEN_COUNT };
 
+constexpr int GIVEN_CURVATURE = (GIVEN_COUNT - 1) * GIVEN_COUNT / 2;  // entries of a symmetric matrix of these derivatives
+
+/// Entries of a residual of a pair that the caller gives: its value, and its derivatives by x, y, heading and speed of the first and of
+/// the second agent.
+enum GivenPair { GIVEN_PAIR_VALUE, GIVEN_PAIR_FIRST, GIVEN_PAIR_SECOND = GIVEN_PAIR_FIRST + 4, GIVEN_PAIR_COUNT = GIVEN_PAIR_SECOND + 4 };
+
+constexpr int GIVEN_PAIR_CURVATURE = (GIVEN_PAIR_COUNT - 1) * GIVEN_PAIR_COUNT / 2;
+
 constexpr int64_t kMostAgents = 64;         // contacts are a 64-bit mask per agent
 constexpr double kWheelbase = 0.6;          // distance between the axles as a share of a vehicle's length
 constexpr double kSlowestSteering = 1.0;    // [m/s]; at lower speeds, a steering angle is computed with this speed
@@ -70,6 +78,12 @@ struct EpoGame {
     int64_t lane_slides;       // whether nearest points of reference lines move with the agents in Gauss-Newton steps
     const void* given;         // [B, M, N, K, R, GIVEN_COUNT] weighted residuals of features that the kernel does not know, or null
     int64_t given_count;       // R
+    const void* given_pairs;   // [B, M, P, K / pair_stride, R', GIVEN_PAIR_COUNT] such residuals of pairs, or null; no agent is held then
+    int64_t given_pair_count;  // R'
+    // Sums of value times second derivatives of the given residuals of an agent and of a pair, entries below and on the diagonal of
+    // symmetric matrices, row by row; null for steps without the Hessian.
+    const void* given_curvature;       // [B, M, N, K, GIVEN_CURVATURE]
+    const void* given_pair_curvature;  // [B, M, P, K / pair_stride, GIVEN_PAIR_CURVATURE]
 };
 
 /// Arguments and results of S steps from `start`, in which the controls of absent agents are zero. Every array of controls is

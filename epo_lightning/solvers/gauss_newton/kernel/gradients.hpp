@@ -38,6 +38,7 @@ void add_gradients(const Games<T>& games, const ParameterGradients<T>& by, uint3
     const EpoGame& game = games.game;
     const int n = games.n;
     const int64_t P = game.N * (game.N - 1) / 2;
+    const bool known = knows_pairs(game);
     for (int lane = 0; lane < Lanes<T>::W; ++lane) {
         if (!(lanes >> lane & 1)) continue;
         int pair = 0;
@@ -55,9 +56,9 @@ void add_gradients(const Games<T>& games, const ParameterGradients<T>& by, uint3
                 by_step[ACCELERATION] += by.reference_thrust[i * game.K + k][lane];
                 by_step[TURN_RATE] += by.reference_turn[i * game.K + k][lane];
             }
-            for (int j = i + 1; games.coupled && j < n; ++j, ++pair) {
+            for (int j = i + 1; known && j < n; ++j, ++pair) {
                 const int64_t a = games.agent[i * Lanes<T>::W + lane], c = games.agent[j * Lanes<T>::W + lane];
-                const int64_t entry = games.problem[lane] * P + a * game.N - a * (a + 1) / 2 + c - a - 1;
+                const int64_t entry = games.problem[lane] * P + games.pair_of(a, c);
                 for (int f = 0; f < PAIR_COUNT; ++f) {
                     if (game.pair[f]) static_cast<T*>(gradients.pair[f])[entry] += by.pair[f * games.pairs + pair][lane];
                     if (gradients.margins[f])

@@ -151,12 +151,15 @@ struct Nearest {
     }
 };
 
-/// Whether a game has pair features.
-inline bool interacts(const EpoGame& game) {
+/// Whether a game has pair features that the kernel knows.
+inline bool knows_pairs(const EpoGame& game) {
     for (const void* weights : game.pair)
         if (weights) return true;
     return false;
 }
+
+/// Whether a game has pair features.
+inline bool interacts(const EpoGame& game) { return game.given_pairs || knows_pairs(game); }
 
 /// Entry of an array [B, M, P] with strides.
 template <class T>
@@ -188,6 +191,8 @@ struct Games {
     Vec<T>*turn, *thrust;                 // controls [n, K]
     Vec<T>*reference_turn, *reference_thrust;  // [movers, K], only for features of reference controls
     Vec<T>* given;                        // [movers, K, R, GIVEN_COUNT], only if there are given residuals
+    Vec<T>* given_pairs;                  // [pairs, K / pair_stride, R', GIVEN_PAIR_COUNT], only if there are given ones of pairs
+    Vec<T>*given_curvature, *given_pair_curvature;  // as in `EpoGame`, for steps with the Hessian
     std::vector<Path<T>> path;
 
     Vec<T> own(int feature, int i) const { return weight[i * OWN_COUNT + feature]; }
@@ -268,6 +273,9 @@ struct Games {
     }
 
     int64_t row_of(int i, int lane) const { return int64_t(problem[lane]) * game.N + agent[i * W + lane]; }
+
+    /// Index of the pair of the agents a < c of a game among its P pairs.
+    int64_t pair_of(int64_t a, int64_t c) const { return a * game.N - a * (a + 1) / 2 + c - a - 1; }
 
     Path<T> new_path() const {
         const int steps = K + 1;
@@ -449,15 +457,7 @@ struct Games {
             reference_thrust = arena.take(movers * K);
             load(movers, static_cast<const T*>(game.reference_controls), reference_turn, reference_thrust);
         }
-        if (game.given) {
-            const int each = int(K * game.given_count) * GIVEN_COUNT;
-            given = arena.take(movers * each);
-            for (int i = 0; i < movers; ++i) {
-                const T* rows[W];
-                for (int lane = 0; lane < W; ++lane) rows[lane] = static_cast<const T*>(game.given) + row_of(i, lane) * each;
-                gather<T>(rows, each, [&](int e, Vec<T> value) { given[i * each + e] = value; });
-            }
-        }
+        load_given();
         goal_x = arena.take(movers);
         goal_y = arena.take(movers);
         goal_heading = arena.take(movers);
@@ -491,11 +491,10 @@ struct Games {
                 if (has(STEER)) wheelbase[i][lane] = T(kWheelbase) * size[2 * row];
             }
             int p = 0;
-            for (int i = 0; coupled && i < movers; ++i)
+            for (int i = 0; knows_pairs(game) && i < movers; ++i)
                 for (int j = i + 1; j < n; ++j, ++p) {
-                    const int64_t one = agent[i * W + lane], other = agent[j * W + lane];
-                    const int64_t a = std::min(one, other), c = std::max(one, other);
-                    const int64_t pair = a * game.N - a * (a + 1) / 2 + c - a - 1;
+                    const int64_t a = std::min(agent[i * W + lane], agent[j * W + lane]);
+                    const int64_t c = std::max(agent[i * W + lane], agent[j * W + lane]), pair = pair_of(a, c);
                     const T *first = size + 2 * (b * game.N + a), *second = size + 2 * (b * game.N + c);
                     for (int f = 0; f < PAIR_COUNT; ++f) {
                         if (!has_pair(f)) continue;
@@ -514,6 +513,43 @@ struct Games {
 
   private:
     std::vector<int> owners_;
+
+    /// Loads what the caller gives of features that the kernel does not know.
+    void load_given() {
+        const int states = int(K / game.pair_stride);
+        given = load_rows(game.given, int(K * game.given_count) * GIVEN_COUNT);
+        given_curvature = load_rows(game.given_curvature, K * GIVEN_CURVATURE);
+        given_pairs = load_pair_rows(game.given_pairs, int(states * game.given_pair_count) * GIVEN_PAIR_COUNT);
+        given_pair_curvature = load_pair_rows(game.given_pair_curvature, states * GIVEN_PAIR_CURVATURE);
+    }
+
+    /// The rows of the movers in an array [B, M, N, each], as [movers, each]; null for no array.
+    Vec<T>* load_rows(const void* from, int each) {
+        if (!from) return nullptr;
+        Vec<T>* to = arena.take(movers * each);
+        const T* rows[W];
+        for (int i = 0; i < movers; ++i) {
+            for (int lane = 0; lane < W; ++lane) rows[lane] = static_cast<const T*>(from) + row_of(i, lane) * each;
+            gather<T>(rows, each, [&](int e, Vec<T> value) { to[i * each + e] = value; });
+        }
+        return to;
+    }
+
+    /// The rows of the pairs in an array [B, M, P, each], as [pairs, each]; null for no array.
+    Vec<T>* load_pair_rows(const void* from, int each) {
+        if (!from) return nullptr;
+        Vec<T>*to = arena.take(pairs * each), *next = to;
+        const T* rows[W];
+        for (int i = 0; i < movers; ++i)
+            for (int j = i + 1; j < n; ++j, next += each) {
+                for (int lane = 0; lane < W; ++lane) {
+                    const int64_t first = problem[lane] * game.N * (game.N - 1) / 2;
+                    rows[lane] = static_cast<const T*>(from) + (first + pair_of(agent[i * W + lane], agent[j * W + lane])) * each;
+                }
+                gather<T>(rows, each, [&](int e, Vec<T> value) { next[e] = value; });
+            }
+        return to;
+    }
 
     template <bool TANGENTS, int STATES>
     INLINE void find_nearest_at(int i, int k, const Vec<T>* s) {

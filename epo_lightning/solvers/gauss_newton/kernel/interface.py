@@ -41,6 +41,8 @@ SIGNALS = ("vel", "acc", "turnr", "jerk", "turnacc")
 """Signals with bounds in the kernel's order."""
 GIVEN = 7
 """Entries of a given residual: its value, and its derivatives by the four numbers of a state and by its two controls."""
+GIVEN_PAIR = 9
+"""Entries of a given residual of a pair: its value, and its derivatives by the states of both agents."""
 MOST_AGENTS = 64
 """Contacts are a 64-bit mask in the kernel, hence at most 64 agents."""
 
@@ -73,6 +75,10 @@ class EpoGame(ctypes.Structure):
         ("lane_slides", Integer),
         ("given", Address),
         ("given_count", Integer),
+        ("given_pairs", Address),
+        ("given_pair_count", Integer),
+        ("given_curvature", Address),
+        ("given_pair_curvature", Address),
     )
 
 
@@ -163,11 +169,13 @@ def layout() -> dict[str, float]:
         name = structure.__name__
         found[f"sizeof {name}"] = ctypes.sizeof(structure)
         found |= {f"{name}.{field[0]}": getattr(structure, field[0]).offset for field in structure._fields_}
-    found |= {name.upper(): index for index, name in enumerate(OWN)} | {"OWN_COUNT": len(OWN), "GIVEN_COUNT": GIVEN}
+    found |= {name.upper(): index for index, name in enumerate(OWN)} | {"OWN_COUNT": len(OWN)}
     found |= {name.upper(): index for index, name in enumerate(PAIR)} | {"PAIR_COUNT": len(PAIR)}
     found |= {f"BOUND_{name.upper()}": index for index, name in enumerate(SIGNALS)} | {"BOUND_COUNT": len(SIGNALS)}
     found |= {status.name: status.value for status in Status}
     return found | {
+        "GIVEN_COUNT": GIVEN,
+        "GIVEN_PAIR_COUNT": GIVEN_PAIR,
         "kMostAgents": MOST_AGENTS,
         "kWheelbase": WHEELBASE,
         "kSlowestSteering": SLOWEST_STEERING,

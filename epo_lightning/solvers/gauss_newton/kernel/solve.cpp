@@ -20,6 +20,24 @@ namespace {
 
 static_assert(kMostAgents == 8 * sizeof(uint64_t), "contacts are a mask of one bit per agent");
 
+/// Adds the contacts of given residuals to those of W problems: of present agents with a residual that is not zero, or of which a
+/// derivative is not.
+template <class T>
+void find_given_contacts(const EpoGame& game, const int* problems, uint64_t* touching) {
+    constexpr int W = Lanes<T>::W;
+    const int64_t N = game.N, each = game.K / game.pair_stride * game.given_pair_count * GIVEN_PAIR_COUNT;
+    for (int lane = 0; lane < W; ++lane) {
+        const uint8_t* present = game.present + problems[lane] / game.M * N;
+        const T* row = static_cast<const T*>(game.given_pairs) + problems[lane] * (N * (N - 1) / 2) * each;
+        for (int64_t i = 0; i < N; ++i)
+            for (int64_t j = i + 1; j < N; ++j, row += each) {
+                if (!present[i] || !present[j] || std::all_of(row, row + each, [](T entry) { return entry == 0; })) continue;
+                touching[i * W + lane] |= uint64_t(1) << j;
+                touching[j * W + lane] |= uint64_t(1) << i;
+            }
+    }
+}
+
 /// Contacts between the agents of W problems: bit j of touching[i * W + lane] is set where i and j overlap. Contacts between two
 /// agents of the mask `held` are not looked for.
 template <class T>
@@ -76,7 +94,6 @@ void find_contacts(
             *high_y = most<T>(*high_y, py);
         }
     }
-    std::memset(touching, 0, sizeof(uint64_t) * N * W);
     int pair = 0;
     for (int i = 0; i < N; ++i)
         for (int j = i + 1; j < N; ++j, ++pair) {
@@ -139,7 +156,9 @@ Plan make_plan(
                 if (!held.empty()) held_in_all &= held[problems[lane] - first];
             }
             arena.clear();
-            find_contacts<T>(game, arena, problems, held_in_all, controls, touching.data());
+            std::fill(touching.begin(), touching.end(), 0);
+            if (knows_pairs(game)) find_contacts<T>(game, arena, problems, held_in_all, controls, touching.data());
+            if (game.given_pairs) find_given_contacts<T>(game, problems, touching.data());
         }
         for (int lane = 0; lane < filled; ++lane) {
             if (done[start + lane - first]) continue;

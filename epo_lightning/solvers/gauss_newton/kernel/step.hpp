@@ -57,6 +57,20 @@ INLINE void add_disc_costs(const Group<T, N>& g, int feature, int state, bool ex
         }
 }
 
+/// Adds the products of the derivatives `row` of a residual to P, where `at` are the indices of their entries.
+template <class T>
+INLINE void add_products(const Vec<T>* row, const int* at, int count, int ld, Vec<T>* P) {
+    for (int e = 0; e < count; ++e)
+        for (int f = 0; f <= e; ++f) P[std::max(at[e], at[f]) * ld + std::min(at[e], at[f])] += row[e] * row[f];
+}
+
+/// Adds the entries of a symmetric matrix to P: those below and on its diagonal, row by row; arguments as for `add_products`.
+template <class T>
+INLINE void add_symmetric(const Vec<T>* entries, const int* at, int count, int ld, Vec<T>* P) {
+    for (int e = 0; e < count; ++e)
+        for (int f = 0; f <= e; ++f) P[std::max(at[e], at[f]) * ld + std::min(at[e], at[f])] += *entries++;
+}
+
 /// Indices of the entries of P and y that belong to position, heading and speed of two agents, in the order of `Slope`.
 INLINE void entries_of(int i, int j, int m, int* at) {
     const int both[2] = {i, j};
@@ -87,8 +101,7 @@ NOINLINE void add_state_pair_costs(const Games<T>& g, int state, bool exact, Vec
                 if (!P) continue;
                 Vec<T> row[8];
                 for (int e = 0; e < unknowns; ++e) row[e] = weight * d.by[e];
-                for (int e = 0; e < unknowns; ++e)
-                    for (int f = 0; f <= e; ++f) P[std::max(at[e], at[f]) * ld + std::min(at[e], at[f])] += row[e] * row[f];
+                add_products<T>(row, at, unknowns, ld, P);
                 // Two columns of the feature's Hessian at a time. Features depend on the difference of the two positions, so the
                 // columns of the second one are those of the first with the other sign.
                 PairValue<Dual<T>> of_position, of_motion;
@@ -109,7 +122,7 @@ NOINLINE void add_state_pair_costs(const Games<T>& g, int state, bool exact, Vec
 /// Adds the costs of given residuals at one state, which also depend on the controls of the step before it; arguments as for
 /// `add_state_costs`.
 template <class T>
-NOINLINE void add_given_costs(const Games<T>& g, int state, Vec<T>* P, Vec<T>* y, Vec<T>& energy) {
+NOINLINE void add_given_costs(const Games<T>& g, int state, bool exact, Vec<T>* P, Vec<T>* y, Vec<T>& energy) {
     const int m = 2 * g.movers, ld = 3 * m, count = int(g.game.given_count);
     for (int i = 0; i < g.movers; ++i) {
         const Vec<T>* row = g.given + (i * g.K + state - 1) * count * GIVEN_COUNT;
@@ -119,10 +132,34 @@ NOINLINE void add_given_costs(const Games<T>& g, int state, Vec<T>* P, Vec<T>* y
             const Vec<T> value = row[GIVEN_VALUE], *by = row + GIVEN_X;
             energy += T(0.5) * value * value;
             for (int e = 0; e < 6; ++e) y[at[e]] += value * by[e];
-            for (int e = 0; P && e < 6; ++e)
-                for (int f = 0; f <= e; ++f) P[std::max(at[e], at[f]) * ld + std::min(at[e], at[f])] += by[e] * by[f];
+            if (P) add_products<T>(by, at, 6, ld, P);
         }
+        if (P && exact) add_symmetric<T>(g.given_curvature + (i * g.K + state - 1) * GIVEN_CURVATURE, at, 6, ld, P);
     }
+}
+
+/// Adds the costs of given residuals of pairs at one state; arguments as for `add_state_costs`.
+template <class T>
+NOINLINE void add_given_pair_costs(const Games<T>& g, int state, bool exact, Vec<T>* P, Vec<T>* y, Vec<T>& energy) {
+    const int m = 2 * g.n, ld = 3 * m, count = int(g.game.given_pair_count);
+    const int stride = int(g.game.pair_stride), states = g.K / stride;
+    int place = state / stride - 1;  // among the evaluated states of all pairs
+    for (int i = 0; i < g.n; ++i)
+        for (int j = i + 1; j < g.n; ++j, place += states) {
+            int at[8];
+            entries_of(i, j, m, at);
+            const Vec<T>* row = g.given_pairs + place * count * GIVEN_PAIR_COUNT;
+            for (int r = 0; r < count; ++r, row += GIVEN_PAIR_COUNT) {
+                const Vec<T>*by = row + GIVEN_PAIR_FIRST, value = row[GIVEN_PAIR_VALUE];
+                Vec<T> all = value * value;  // zero where the residual and all its derivatives are
+                for (int e = 0; e < 8; ++e) all += by[e] * by[e];
+                if (!any<T>(all != 0)) continue;
+                energy += T(0.5) * value * value;
+                for (int e = 0; e < 8; ++e) y[at[e]] += value * by[e];
+                if (P) add_products<T>(by, at, 8, ld, P);
+            }
+            if (P && exact) add_symmetric<T>(g.given_pair_curvature + place * GIVEN_PAIR_CURVATURE, at, 8, ld, P);
+        }
 }
 
 /// Adds the second derivatives of the costs of a state to P [3m, 3m] (unless it is null) and their gradient to y [3m]; returns
@@ -152,11 +189,12 @@ INLINE Vec<T> add_state_costs(const Group<T, N>& g, int state, bool exact, Vec<T
             P[(2 * i + 1) * ld + 2 * i + 1] -= y_ * y_;
         }
     }
-    if (g.game.given) add_given_costs<T>(g, state, P, y, energy);
+    if (g.game.given) add_given_costs<T>(g, state, exact, P, y, energy);
     if (!g.pairs_count_at(state)) return energy;
     for (const int feature : {PROXIMITY, CLEARANCE})
         if (g.has_pair(feature)) add_disc_costs(g, feature, state, exact, P, y, energy);
     if (g.state_pairs) add_state_pair_costs<T>(g, state, exact, P, y, energy);
+    if (g.game.given_pairs) add_given_pair_costs<T>(g, state, exact, P, y, energy);
     return energy;
 }
 

@@ -16,7 +16,7 @@ INLINE bool finite(T value) {
 /// result, such as the weight of a pair that never touches, or points of a line that are never the nearest.
 template <class T>
 bool valid(const EpoGame& game, int64_t problem) {
-    const bool coupled = interacts(game);
+    const bool coupled = knows_pairs(game);
     const int64_t b = problem / game.M, m = problem % game.M;
     const uint8_t* present = game.present + b * game.N;
     int64_t pair = 0;
