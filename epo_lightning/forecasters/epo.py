@@ -187,7 +187,7 @@ class EPO(Forecaster):
         self.gate = None if gate is None else build("gate", gate, ahead=ahead, width=width, scale=scale)
 
     def forward(self, scene: Scene) -> JointForecast:
-        """Features, goals, game parameters, solution, probabilities: the order of the paper's Fig. 2."""
+        """Features, goals, game parameters, solution, probabilities: the order of the paper's Fig. 3."""
         z = self.backbone(scene)
         goals = self.goals(z, scene)
         solved_scene = self._with_game_end(scene)
