@@ -14,9 +14,10 @@ from epo_lightning.scene import HEADING, rotated
 class SceneProbabilities(nn.Module):
     """phi_prob: logits of the M joint futures from all agents' features and all futures (Section 4.4).
 
-    The paper concatenates the features and trajectories of all agents and applies a linear layer. Here that layer has the
-    same block for every agent, so its result is a sum over agents and works for any number and order of agents and any
-    padding. Inputs are future positions relative to the agent's current position, without a gradient.
+    The paper concatenates the features and trajectories of all agents and applies a perceptron of two layers. Here the first
+    layer, which is the product of two linear maps, has the same block for every agent. Its result is a sum over agents, so
+    any number and order of agents and any padding work. Inputs are future positions relative to the agent's current
+    position, without a gradient.
 
     The sum comes before the first nonlinearity, so of the motions the logits see only the sum of all displacements: "both
     agents pass on the left" and "both pass on the right" have the same probability. :class:`PairwiseProbabilities` tells

@@ -37,8 +37,9 @@ class FeatureEnergy(FeatureInputs):
     """The potential of Eqs. 10 and 11, E = 1/2 sum_i |w_i c(u_i, g_i)|^2 + 1/2 sum_{i<j} |w_ij d(u_i, u_j)|^2.
 
     Every named feature has a weight of its own: a residual is w c, so weights enter the energy squared and their sign has
-    no effect. Because the pair terms are symmetric, a minimum of E is an open-loop Nash equilibrium in which agent i
-    minimises its own terms plus the pair terms it takes part in (Theorem 1).
+    no effect. (Eq. 10 prints w^T c, a sum over features. Here w c is the vector of all weighted features, which have
+    different units and lengths.) Because the pair terms are symmetric, a minimum of E is an open-loop Nash equilibrium in
+    which agent i minimises its own terms plus the pair terms it takes part in (Theorem 1).
 
     :meth:`residuals` is the reference. The fast solver evaluates the same features, with their derivatives, in
     :mod:`epo_lightning.solvers.gauss_newton.expansion`. A feature is *declared* if its source gives its Jacobian in closed
