@@ -1,8 +1,8 @@
 """The energy-based potential game layer (Section 4.3): S damped Gauss-Newton steps, differentiable.
 
-One step solves (J^T J + lambda I) d = -J^T r and moves u to u + alpha d, as the paper and Theseus define it. All scenes and
-modes are solved at once and independently of each other. If a matrix cannot be factorised, its problem (one scene
-and mode) keeps its last good iterate; on a CPU, the factorisation is first repeated with more damping. One of the
+One step solves (J^T J + lambda I) d = -J^T r and moves u to u + alpha d, as Theseus does, which the paper uses. All scenes
+and modes are solved at once and independently of each other. If a matrix cannot be factorised, its problem (one scene and
+mode) keeps its last good iterate; on a CPU, the factorisation is first repeated with more damping. One of the
 :mod:`~epo_lightning.solvers.gauss_newton.backends` computes the steps. With adaptive damping,
 :mod:`~epo_lightning.solvers.gauss_newton.adaptive` or the backend's kernel accepts or rejects them.
 """
