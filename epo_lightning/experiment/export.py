@@ -23,7 +23,7 @@ from epo_lightning.experiment.predict import MEANING, scenes_of
 from epo_lightning.experiment.program_files import FORMATS, Format, Run, Tensors
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.forecasters.epo import EPO
-from epo_lightning.forecasters.refined import Refined
+from epo_lightning.forecasters.game_forecaster import GameForecaster
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder
@@ -134,7 +134,7 @@ def check_exportable(forecaster: Forecaster, title: str, form: Format) -> None:
         )
 
 
-def _obstacles(game: EPO | Refined) -> list[str]:
+def _obstacles(game: GameForecaster) -> list[str]:
     """Parts of a game that a program cannot have, each with the setting that does without it."""
     found = []
     if isinstance(game, EPO) and game.calibration is not None:
@@ -153,9 +153,9 @@ def _obstacles(game: EPO | Refined) -> list[str]:
     return found
 
 
-def games_of(forecaster: Forecaster) -> list[EPO | Refined]:
+def games_of(forecaster: Forecaster) -> list[GameForecaster]:
     """The parts of a forecaster that solve games; a refinement may refine another one's solutions."""
-    return [part for part in forecaster.modules() if isinstance(part, EPO | Refined)]
+    return [part for part in forecaster.modules() if isinstance(part, GameForecaster)]
 
 
 def inputs_of(forecaster: Forecaster, scenes: Scene) -> Tensors:

@@ -20,7 +20,6 @@ from epo_lightning.decoders.orders import DecodedOrders, Orders
 from epo_lightning.decoders.probabilities import PROBABILITIES, check_probabilities
 from epo_lightning.decoders.weights import Margins
 from epo_lightning.forecast import GameParameters, JointForecast, Solution, Status
-from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.forecasters.combination import Combination
 from epo_lightning.forecasters.epo_decoders import (
     goals_decoder,
@@ -41,10 +40,11 @@ from epo_lightning.forecasters.epo_settings import (
     check_pair_start,
     check_start,
 )
+from epo_lightning.forecasters.game_forecaster import GameForecaster
 from epo_lightning.forecasters.repeats import repeats_joined, without_repeated_choices
 from epo_lightning.game.energy import FEATURES, RESIDUALS, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
-from epo_lightning.objectives.base import Objective, Terms
+from epo_lightning.objectives.base import Objective
 from epo_lightning.optimizers import Adam
 from epo_lightning.registry import build, register
 from epo_lightning.scene import Scene
@@ -61,7 +61,7 @@ candidates; then it is measured in all scenes."""
 
 
 @register("forecaster", "epo")
-class EPO(Forecaster):
+class EPO(GameForecaster):
     """Forecaster whose network infers a game (weights, goals, initial strategies), and whose solver minimises its energy.
 
     Goals: a single candidate is a given goal, the same in all modes. If there are several candidates, and the energy has a
@@ -109,8 +109,6 @@ class EPO(Forecaster):
         ConfigError: parts that do not work together, with the changes that would work; or a value out of its range.
     """
 
-    solver: Minimiser
-
     def __init__(
         self,
         task: Task,
@@ -157,8 +155,6 @@ class EPO(Forecaster):
         self.backbone, self.energy, self.solver, self.modes = backbone, energy, solver.for_modes(modes), modes
         self.reads_goal_headings = "goal_headings" in energy.needs
         self.longest_game = self.game_horizon if self.game_horizon > task.horizon else None
-        # The part `backward` runs the minimiser and defines the derivative of its solution. (A LightningModule has a method
-        # of that name.)
         self.differentiable_solve, self.objective = backward, objective
         # M games, one per mode; or one game for all modes, which solvers that choose among candidates always have.
         games = 1 if one_game else solver.games(modes)
@@ -190,14 +186,14 @@ class EPO(Forecaster):
         """Features, goals, game parameters, solution, probabilities: the order of the paper's Fig. 3."""
         z = self.backbone(scene)
         goals = self.goals(z, scene)
-        solved_scene = self._with_game_end(scene)
+        solved_scene = self.game_scene(scene)
         orders = self._decode_orders(z, scene)
         parameters = self._infer_game(z, scene, goals, orders)
         if self.calibration is not None and not self.training:
             parameters = self.calibration(self.solver, self.energy, solved_scene, parameters)
         if TABLES not in self.solver.provides:
             parameters = parameters.for_every_mode(self.modes)
-        solution = self.differentiable_solve(self._minimiser, self.energy, solved_scene, parameters)
+        solution = self.differentiable_solve(self.minimiser, self.energy, solved_scene, parameters)
         settled = self._without_noise(solution, solved_scene, parameters)
         states, controls = settled.states[..., : self.task.horizon, :], settled.controls[..., : self.task.horizon, :]
         logits = self._mode_logits(z, scene, goals, orders, settled)
@@ -217,7 +213,7 @@ class EPO(Forecaster):
             goal_logits=goals.logits,
         )
 
-    def _with_game_end(self, scene: Scene) -> Scene:
+    def game_scene(self, scene: Scene) -> Scene:
         """The scene as the solver sees it.
 
         If ``game_horizon`` is longer than the forecast, games end at their own ends, or at ``game_horizon`` if that is
@@ -294,16 +290,12 @@ class EPO(Forecaster):
             weights = {name: weight * factor[:, None] for name, weight in weights.items()}
         return weights, {} if self.margins is None else self.margins(z, chosen)
 
-    @property
-    def _minimiser(self) -> Minimiser:
-        return self.solver if self.training else self.solver.for_test()
-
     def _without_noise(self, solution: Solution, scene: Scene, parameters: GameParameters) -> Solution:
         """The solution that is the forecast. A sampling solver is run again without noise, also in training.
 
         So probabilities are learned on forecasts like those outside training.
         """
-        if SAMPLES not in self._minimiser.provides:
+        if SAMPLES not in self.minimiser.provides:
             return solution
         with torch.no_grad():
             return self.solver.for_test()(self.energy, scene, parameters)
@@ -341,16 +333,6 @@ class EPO(Forecaster):
         states = self.energy.dynamics.rollout(self.energy.current_states(scene), controls, scene.dt)
         return states.expand(-1, self.modes, -1, -1, -1)
 
-    def explain(self, scene: Scene, forecast: JointForecast) -> JointForecast:
-        assert forecast.parameters is not None
-        assert forecast.solution is not None
-        terms = self.energy.terms(self._with_game_end(scene), forecast.parameters, forecast.solution.controls)
-        return dataclasses.replace(
-            forecast,
-            own_energy={name: terms[name] for name in self.energy.own},
-            pair_energy={name: terms[name] for name in self.energy.pair},
-        )
-
     @torch.no_grad()
     def examine(self, scene: Scene, forecast: JointForecast) -> JointForecast:
         """The forecast with its distance from an equilibrium, and with the solutions of its games without pair terms.
@@ -364,7 +346,7 @@ class EPO(Forecaster):
         scenes = len(scene.history)
         stride = 1 if cheap else max(1, self._batches * scenes // EXAMINED)
         chosen = torch.arange(0, scenes, stride, device=scene.history.device)
-        report = equilibrium(self.energy, self._with_game_end(scene)[chosen], forecast[chosen])
+        report = equilibrium(self.energy, self.game_scene(scene)[chosen], forecast[chosen])
         if report is None:
             return forecast
         if RESIDUALS not in self.energy.offers:
@@ -393,13 +375,10 @@ class EPO(Forecaster):
 
     def solve(self, scene: Scene, parameters: GameParameters) -> Solution:
         """The solution of a given game of a scene, for example an inferred one with other weights or goals."""
-        return self.differentiable_solve(self._minimiser, self.energy, self._with_game_end(scene), parameters)
+        return self.differentiable_solve(self.minimiser, self.energy, self.game_scene(scene), parameters)
 
     @property
     def _batches(self) -> int:
         """Number of test batches; 1 outside a Trainer."""
         counts = self._trainer.num_test_batches if self._trainer is not None else [1]
         return int(sum(counts)) or 1
-
-    def losses(self, scene: Scene, forecast: JointForecast) -> Terms:
-        return self.objective(self._with_game_end(scene), forecast, self.energy, self.global_step)

@@ -16,8 +16,9 @@ from epo_lightning.forecast import JointForecast
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.forecasters.combination import Combination
 from epo_lightning.forecasters.epo_settings import check_start
+from epo_lightning.forecasters.game_forecaster import GameForecaster
 from epo_lightning.game.energy import Energy
-from epo_lightning.objectives.base import Objective, Terms
+from epo_lightning.objectives.base import Objective
 from epo_lightning.optimizers import Adam
 from epo_lightning.refinement.game import NOISE, check_energy, refined
 from epo_lightning.registry import ConfigError, nearest, register
@@ -28,7 +29,7 @@ from epo_lightning.task import Task
 
 
 @register("forecaster", "refined")
-class Refined(Forecaster):
+class Refined(GameForecaster):
     """Forecaster that refines the joint modes of a trained one (:mod:`epo_lightning.refinement`).
 
     The trained forecaster stays as it is. One weight per feature, shared by all agents, pairs, modes and scenes, and the
@@ -50,8 +51,6 @@ class Refined(Forecaster):
     Raises:
         ConfigError: parts that do not work together, or a forecaster of another task.
     """
-
-    solver: Minimiser
 
     def __init__(
         self,
@@ -83,7 +82,7 @@ class Refined(Forecaster):
         self.reads_history, self.reads_goal_headings = given.reads_history, given.reads_goal_headings
         self.longest_game = given.longest_game
         self.energy, self.solver, self.objective, self.noise = energy, solver, objective, noise
-        self.differentiable_solve = backward  # a LightningModule has a method `backward`
+        self.differentiable_solve = backward
         own, pair = energy.weighted
         _check_pair_start(pair_start, pair)
         self.own_weights = SharedWeights(1, own, check_start(own_start, own, energy.own))
@@ -113,24 +112,13 @@ class Refined(Forecaster):
             {},
             self.log_inverse_temperature.exp(),
             self.noise,
-            self.solver if self.training else self.solver.for_test(),
+            self.minimiser,
             self.differentiable_solve,
         )
 
-    def explain(self, scene: Scene, forecast: JointForecast) -> JointForecast:
-        assert forecast.parameters is not None
-        assert forecast.controls is not None
-        game = dataclasses.replace(scene, game_steps=None)
-        terms = self.energy.terms(game, forecast.parameters, forecast.controls)
-        return dataclasses.replace(
-            forecast,
-            own_energy={name: terms[name] for name in self.energy.own},
-            pair_energy={name: terms[name] for name in self.energy.pair},
-        )
-
-    def losses(self, scene: Scene, forecast: JointForecast) -> Terms:
-        game = dataclasses.replace(scene, game_steps=None)
-        return self.objective(game, forecast, self.energy, self.global_step)
+    def game_scene(self, scene: Scene) -> Scene:
+        """The scene as the solver sees it: without ``game_steps``, because all games end with the forecast."""
+        return dataclasses.replace(scene, game_steps=None)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """The configuration, with that of the given forecaster, whose weights are among the saved ones."""
