@@ -1,7 +1,7 @@
 """The gradient of phi = -<J mu, r + J d>, with mu and d constant, by controls and parameters; as in `kernel/step.hpp`.
 
-The costs of single agents are here, and those of pairs in `pair_adjoint.py`. Threads share out agents at all times; in
-between, cotangents are summed backwards in time.
+The costs of headings, speeds and controls are here, those of positions in `position_adjoint.py`, and those of pairs in
+`pair_adjoint.py`. Threads share out agents at all times; in between, cotangents are summed backwards in time.
 """
 
 from types import SimpleNamespace
@@ -14,21 +14,15 @@ from epo_lightning.solvers.gauss_newton.fused_kernel.constants import (
     ACC,
     ACCB,
     ACCREF,
-    AHEAD_X,
-    AHEAD_Y,
     BOUND_ACC,
     BOUND_JERK,
     BOUND_TURNACC,
     BOUND_TURNR,
     BOUND_VEL,
     COSINE,
-    GOAL,
     HEADING,
     JERK,
     JERKB,
-    LANE,
-    NEAR_X,
-    NEAR_Y,
     SINE,
     SPEED,
     STEER,
@@ -42,8 +36,6 @@ from epo_lightning.solvers.gauss_newton.fused_kernel.constants import (
     VEL,
     VELB,
     VELREF,
-    X,
-    Y,
 )
 
 
@@ -59,144 +51,19 @@ def make(
 ) -> SimpleNamespace:
     """The functions for numbers of type ``T``; ``func`` decorates the longer ones."""
     sync, lane, sums_back = threads.sync, threads.lane, threads.sums_back
-    Game, Gradients, Layout, pair_index, weight, trace = (
+    Game, Gradients, Layout, pair_index, weight = (
         games.Game,
         games.Gradients,
         games.Layout,
         games.pair_index,
         games.weight,
-        games.trace,
     )
     own_slot, pair_count, horizon = games.own_slot, games.pair_count, games.horizon
     Array, Numbers, A = games.Array, games.Numbers, games.agents
     P = A * (A - 1) // 2
-    six = wp.types.vector(6, T)
     excess, excess_slope, steering = residuals.excess, residuals.excess_slope, residuals.steering
-    tangent, along = trajectories.tangent, trajectories.along
+    trace, tangent, along = trajectories.trace, trajectories.tangent, trajectories.along
     keep_own_product, residual_adjoint = products.keep_own_product, products.residual_adjoint
-
-    @wp.func
-    def pull_to(
-        g: Game,
-        at: Layout,
-        work: Array,
-        feature: int,
-        row: int,
-        i: int,
-        k: int,
-        gap_x: T,
-        gap_y: T,
-        x1: T,
-        y1: T,
-        x2: T,
-        y2: T,
-        tx: T,
-        ty: T,
-        slides: int,
-    ):
-        """Cotangents of a position that is drawn to a point, which slides along the unit tangent (tx, ty)."""
-        w = weight(g, feature, row)
-        square = w * w
-        along_tangent = x1 * tx + y1 * ty
-        across_x = x1 - along_tangent * tx
-        across_y = y1 - along_tangent * ty
-        mu_x = x1
-        mu_y = y1
-        off_x = gap_x + x2
-        off_y = gap_y + y2
-        if slides == 1:
-            ahead = x2 * tx + y2 * ty
-            mu_x = across_x
-            mu_y = across_y
-            off_x -= ahead * tx
-            off_y -= ahead * ty
-        keep_own_product(g, at, work, feature, i, k, T(-2.0) * w * (mu_x * off_x + mu_y * off_y))
-        return -square * six(across_x, across_y, off_x, off_y, mu_x, mu_y)
-
-    @func
-    def position_adjoint(
-        g: Game,
-        by: Gradients,
-        game: int,
-        n: int,
-        agents: Numbers,
-        at: Layout,
-        work: Array,
-        path: Array,
-        nearest: Array,
-        end: int,
-    ):
-        """The cotangents of positions and of their tangents at all states, summed over the states from each on."""
-        K = horizon(g)
-        each = n * (K + 1)
-        for e in range(lane(), end * n, wp.block_dim()):
-            i = e // end
-            k = e - i * end
-            state = k + 1
-            row = game * g.N + agents[i]
-            x1 = work[tangent(at, K, 0, X, i) + state]
-            y1 = work[tangent(at, K, 0, Y, i) + state]
-            x2 = work[tangent(at, K, 1, X, i) + state]
-            y2 = work[tangent(at, K, 1, Y, i) + state]
-            px = path[trace(at, K, X, i) + state]
-            py = path[trace(at, K, Y, i) + state]
-            found = six(T(0.0))
-            if own_slot(g, LANE) >= 0 and agents[g.N + i] >= 0:
-                place = i * (K + 1) + state
-                found += pull_to(
-                    g,
-                    at,
-                    work,
-                    LANE,
-                    row,
-                    i,
-                    k,
-                    px - nearest[NEAR_X * each + place],
-                    py - nearest[NEAR_Y * each + place],
-                    x1,
-                    y1,
-                    x2,
-                    y2,
-                    nearest[AHEAD_X * each + place],
-                    nearest[AHEAD_Y * each + place],
-                    g.slides,
-                )
-            if own_slot(g, GOAL) >= 0 and state == end:
-                found += pull_to(
-                    g,
-                    at,
-                    work,
-                    GOAL,
-                    row,
-                    i,
-                    k,
-                    px - g.goals[2 * row],
-                    py - g.goals[2 * row + 1],
-                    x1,
-                    y1,
-                    x2,
-                    y2,
-                    T(0.0),
-                    T(0.0),
-                    0,
-                )
-                w = weight(g, GOAL, row)
-                by.goals[2 * row] = by.goals[2 * row] + w * w * x1
-                by.goals[2 * row + 1] = by.goals[2 * row + 1] + w * w * y1
-            for other in range(n):
-                if other != i and pair_count(g) > 0:
-                    p = pair_index(wp.min(i, other), wp.max(i, other), A)
-                    sign = wp.where(other < i, T(-1.0), T(1.0))
-                    for q in range(6):
-                        found[q] += sign * work[at.touching + (q * P + p) * K + k]
-            for q in range(6):
-                work[along(at, K, q, i) + k] = found[q]
-        sync()
-        for e in range(lane(), 6 * n, wp.block_dim()):
-            i = e // 6
-            to = along(at, K, e - 6 * i, i)
-            sums_back(work, to, 1, end, work, to)
-        sync()
 
     @func
     def motion_adjoint(
@@ -396,7 +263,6 @@ def make(
         sync()
 
     return SimpleNamespace(
-        position_adjoint=position_adjoint,
         motion_adjoint=motion_adjoint,
         control_adjoint=control_adjoint,
     )

@@ -1,7 +1,7 @@
 """Costs of states and controls with their first and second derivatives (Gauss-Newton); as in `kernel/step.hpp`.
 
-Threads share out the pairs and the agents of some steps, those from ``first`` on to ``last`` - 1, whose derivatives are then
-in fast memory for the recursion of `recursion.py`.
+Threads share out the agents of some steps, those from ``first`` on to ``last`` - 1, whose derivatives are then in fast
+memory (`places.py`) for the recursion of `recursion.py`. The costs of pairs are in `pair_expansion.py`.
 """
 
 from types import SimpleNamespace
@@ -51,7 +51,7 @@ from epo_lightning.solvers.gauss_newton.fused_kernel.constants import (
     X,
     Y,
 )
-from epo_lightning.solvers.gauss_newton.fused_kernel.layout import CONTROL_ITEMS, Fast
+from epo_lightning.solvers.gauss_newton.fused_kernel.layout import Fast
 from epo_lightning.solvers.gauss_newton.structured import LEAST_RAISED_DAMPING
 
 
@@ -61,159 +61,31 @@ def make(
     threads: SimpleNamespace,
     games: SimpleNamespace,
     residuals: SimpleNamespace,
-    pairs: SimpleNamespace,
+    trajectories: SimpleNamespace,
+    places: SimpleNamespace,
     fast: Fast,
     func: Any,
 ) -> SimpleNamespace:
     """The functions for numbers of type ``T``, with fast memory for ``fast``; ``func`` decorates the longer ones."""
-    evaluate_pair = pairs.evaluate
-    sync, lane, put = threads.sync, threads.lane, threads.put
+    sync, lane, put, trace = threads.sync, threads.lane, threads.put, trajectories.trace
     excess, excess_slope, add_residual, steering = (
         residuals.excess,
         residuals.excess_slope,
         residuals.add_residual,
         residuals.steering,
     )
-    Game, Layout, pair_index, first_agent, trace, nearest_point = (
-        games.Game,
-        games.Layout,
-        games.pair_index,
-        games.first_agent,
-        games.trace,
-        games.nearest_point,
+    Game, Layout, pair_index, nearest_point = games.Game, games.Layout, games.pair_index, games.nearest_point
+    own_slot, pair_count, horizon = games.own_slot, games.pair_count, games.horizon
+    control_items, row_place, value_place, weight = (
+        places.control_items,
+        places.row_place,
+        places.value_place,
+        places.weight,
     )
-    own_slot, pair_feature, pair_count, margin_slot, horizon = (
-        games.own_slot,
-        games.pair_feature,
-        games.pair_count,
-        games.margin_slot,
-        games.horizon,
-    )
-    own_count = games.own_count
-    steps, control_place, own_place, rows_place, weights_place = (
-        fast.steps,
-        fast.control,
-        fast.own,
-        fast.rows,
-        fast.weights,
-    )
+    own_place = fast.own
     Array, Numbers, A = games.Array, games.Numbers, games.agents
-    P = A * (A - 1) // 2
     four = wp.types.vector(4, T)
     block = wp.types.matrix((4, 4), T)
-
-    # ---- Places in fast memory, of numbers of a step
-
-    @wp.func
-    def control_items(k: int):
-        """Derivatives by the controls of a step [13, A]."""
-        return control_place + (k % (steps + 1)) * (CONTROL_ITEMS * A)
-
-    @wp.func
-    def row_place(slot: int, step: int, i: int, other: int):
-        """The gradient of a pair feature by agent i's position, heading and speed."""
-        return rows_place + (((slot * steps + step) * A + i) * A + other) * 4
-
-    @wp.func
-    def value_place(slot: int, step: int, pair: int):
-        """The value of a pair feature."""
-        return row_place(slot, step, pair // 4, pair // 4) + pair % 4
-
-    @wp.func
-    def weight(g: Game, costs: Array, feature: int, i: int):
-        """The weight of an own feature that the energy has."""
-        return costs[weights_place + own_slot(g, feature) * A + i]
-
-    @wp.func
-    def pair_weight_place(g: Game, slot: int, margin: int, pair: int):
-        """The weight of a pair feature, or its margin."""
-        return weights_place + own_count(g) * A + (slot * 2 + margin) * P + pair
-
-    @func
-    def copy_weights(g: Game, game: int, n: int, agents: Numbers, costs: Array):
-        """Copies the weights and margins of a game to fast memory."""
-        for e in range(lane(), own_count(g) * A, wp.block_dim()):
-            slot = e // A
-            i = e - slot * A
-            if i < n:
-                costs[weights_place + e] = g.own[slot * g.G * g.N + game * g.N + agents[i]]
-        all_pairs = (g.N * (g.N - 1)) // 2
-        for e in range(lane(), pair_count(g) * P, wp.block_dim()):
-            slot = e // P
-            p = e - slot * P
-            i = first_agent(p)
-            j = p - pair_index(i, i + 1, A) + i + 1
-            if j < n:
-                place = game * all_pairs + pair_index(agents[i], agents[j], g.N)
-                costs[pair_weight_place(g, slot, 0, p)] = g.pair[slot * g.G * all_pairs + place]
-                margin = T(0.0)
-                if margin_slot(g, slot) >= 0:
-                    margin = g.margins[margin_slot(g, slot) * g.G * all_pairs + place]
-                costs[pair_weight_place(g, slot, 1, p)] = margin
-        sync()
-
-    # ---- Pairs
-
-    @func
-    def expand_pairs(
-        g: Game,
-        game: int,
-        n: int,
-        agents: Numbers,
-        at: Layout,
-        work: Array,
-        path: Array,
-        costs: Array,
-        first: int,
-        last: int,
-    ):
-        """Values, gradients and energies of all pairs."""
-        K = horizon(g)
-        for e in range(lane(), (last - first) * P, wp.block_dim()):
-            step = e // P
-            k = first + step
-            p = e - step * P
-            state = k + 1
-            i = first_agent(p)
-            j = p - pair_index(i, i + 1, A) + i + 1
-            energy = T(0.0)
-            for slot in range(pair_count(g)):
-                of_one = four(T(0.0))
-                of_other = four(T(0.0))
-                pushed = T(0.0)
-                if j < n and state % g.pair_stride == 0:
-                    one = 2 * ((game // g.M) * g.N + agents[i])
-                    other = 2 * ((game // g.M) * g.N + agents[j])
-                    w = costs[pair_weight_place(g, slot, 0, p)]
-                    margin = costs[pair_weight_place(g, slot, 1, p)]
-                    value, x, y, turn1, faster1, turn2, faster2, by_margin = evaluate_pair(
-                        pair_feature(g, slot),
-                        path[trace(at, K, X, i) + state],
-                        path[trace(at, K, Y, i) + state],
-                        path[trace(at, K, COSINE, i) + state],
-                        path[trace(at, K, SINE, i) + state],
-                        path[trace(at, K, SPEED, i) + state],
-                        g.size[one],
-                        g.size[one + 1],
-                        path[trace(at, K, X, j) + state],
-                        path[trace(at, K, Y, j) + state],
-                        path[trace(at, K, COSINE, j) + state],
-                        path[trace(at, K, SINE, j) + state],
-                        path[trace(at, K, SPEED, j) + state],
-                        g.size[other],
-                        g.size[other + 1],
-                        margin,
-                    )
-                    of_one = w * four(x, y, turn1, faster1)
-                    of_other = w * four(-x, -y, turn2, faster2)
-                    pushed = w * value
-                energy += T(0.5) * pushed * pushed
-                put(costs, row_place(slot, step, i, j), of_one[0], of_one[1], of_one[2], of_one[3])
-                put(costs, row_place(slot, step, j, i), of_other[0], of_other[1], of_other[2], of_other[3])
-                costs[value_place(slot, step, p)] = pushed
-            work[at.energy + (A + p) * K + k] = energy
-
-    # ---- Agents
 
     @wp.func
     def motion(g: Game, at: Layout, path: Array, i: int, k: int):
@@ -466,9 +338,4 @@ def make(
             work[at.energy + i * K + k] = work[at.energy + i * K + k] + energy
         sync()
 
-    return SimpleNamespace(
-        copy_weights=copy_weights,
-        expand_pairs=expand_pairs,
-        expand_controls=expand_controls,
-        expand_states=expand_states,
-    )
+    return SimpleNamespace(expand_controls=expand_controls, expand_states=expand_states)

@@ -1,4 +1,4 @@
-"""The games as the kernels read them, their trajectories, and the nearest points of their reference lines."""
+"""The games as the kernels read them, and the nearest points of their reference lines."""
 
 from dataclasses import fields
 from types import SimpleNamespace
@@ -7,18 +7,7 @@ from typing import Any, no_type_check
 import warp as wp
 
 from epo_lightning.solvers.gauss_newton.fused_kernel import layout
-from epo_lightning.solvers.gauss_newton.fused_kernel.constants import (
-    COSINE,
-    LANE,
-    PAIRS,
-    SINE,
-    SPEED,
-    STEER,
-    TURN_RATE,
-    TURNED,
-    X,
-    Y,
-)
+from epo_lightning.solvers.gauss_newton.fused_kernel.constants import LANE, PAIRS, STEER
 from epo_lightning.solvers.gauss_newton.fused_kernel.features import Features
 from epo_lightning.solvers.gauss_newton.kernel.interface import OWN, SIGNALS
 
@@ -29,7 +18,6 @@ def make(
     agents: int,
     features: Features | None,
     steps: int | None,
-    fast: layout.Fast,
     threads: SimpleNamespace,
     func: Any,
 ) -> SimpleNamespace:
@@ -39,7 +27,6 @@ def make(
         agents: number of agents for which memory is laid out; a game has that many or fewer.
         features: the only features that the games have, so that the compiler leaves out all others; None for any.
         steps: the only number of steps K that the games have; None for any.
-        fast: places in the fast memory of a game.
     """
     A = agents
     bytes_each = 8 if T is wp.float64 else 4
@@ -55,14 +42,7 @@ def make(
         PairSlots(*known.margin_slots),
     )
     own_number, pair_number = len(known.own), len(known.pair)
-    sync, lane, sums, direction, nearest_segment = (
-        threads.sync,
-        threads.lane,
-        threads.sums,
-        threads.direction,
-        threads.nearest_segment,
-    )
-    in_fast_memory = fast.path
+    sync, lane, nearest_segment = threads.sync, threads.lane, threads.nearest_segment
 
     # The fields of `layout.Layout`, as a structure of Warp.
     Layout = wp.struct(type("Layout", (), {"__annotations__": {field.name: int for field in fields(layout.Layout)}}))
@@ -319,69 +299,6 @@ def make(
         sync()
         return agents[flag]
 
-    @wp.func
-    def weight(g: Game, feature: int, row: int):
-        """The weight of an own feature that the energy has."""
-        return g.own[own_slot(g, feature) * g.G * g.N + row]
-
-    # ---- Trajectories
-
-    if fast.path < 0:
-
-        @wp.func
-        def path_of(work: Array, fast: Array):
-            return work
-
-        @wp.func
-        def trace(at: Layout, K: int, quantity: int, i: int):
-            return at.path + (quantity * A + i) * (K + 1)
-
-    else:
-
-        @wp.func
-        def path_of(work: Array, fast: Array):
-            """The memory that holds the trajectories."""
-            return fast
-
-        @wp.func
-        def trace(at: Layout, K: int, quantity: int, i: int):
-            """Start of one quantity of agent i's trajectory in it."""
-            return in_fast_memory + (quantity * A + i) * (K + 1)
-
-    @func
-    def roll(g: Game, game: int, n: int, agents: Numbers, at: Layout, path: Array, controls: Array):
-        """Headings and speeds are sums of the controls along time, and positions are sums of the motions that follow.
-
-        The changes are summed on their own: added to a large coordinate, small ones would lose most of their digits.
-        """
-        K = horizon(g)
-        for e in range(lane(), 2 * n, wp.block_dim()):
-            i = e // 2
-            channel = e - 2 * i
-            row = (game // g.M) * g.N + agents[i]
-            turning = channel == TURN_RATE
-            start = g.initial[4 * row + wp.where(turning, 2, 3)]
-            to = trace(at, K, wp.where(turning, TURNED, SPEED), i)
-            sums(controls, (game * g.N + agents[i]) * K * 2 + channel, 2, K, start, g.dt, path, to)
-        sync()
-        for e in range(lane(), n * (K + 1), wp.block_dim()):
-            i = e // (K + 1)
-            k = e - i * (K + 1)
-            sine = trace(at, K, SINE, i) + k
-            cosine = trace(at, K, COSINE, i) + k
-            direction(path[trace(at, K, TURNED, i) + k], path, sine, cosine)
-            along = g.dt * path[trace(at, K, SPEED, i) + k]
-            path[trace(at, K, X, i) + k] = along * path[cosine]
-            path[trace(at, K, Y, i) + k] = along * path[sine]
-        sync()
-        for e in range(lane(), 2 * n, wp.block_dim()):
-            i = e // 2
-            axis = e - 2 * i
-            start = g.initial[4 * ((game // g.M) * g.N + agents[i]) + axis]
-            to = trace(at, K, wp.where(axis == 0, X, Y), i)
-            sums(path, to, 1, K, start, T(1.0), path, to)
-        sync()
-
     @func
     def nearest_point(g: Game, line: int, x: T, y: T):
         """The nearest point of a line, and the tangent there where it moves along; without a line, the point itself."""
@@ -413,6 +330,11 @@ def make(
         scale = wp.sqrt(inside)
         return near_x, near_y, ahead_x * scale, ahead_y * scale
 
+    @wp.func
+    def weight(g: Game, feature: int, row: int):
+        """The weight of an own feature that the energy has."""
+        return g.own[own_slot(g, feature) * g.G * g.N + row]
+
     return SimpleNamespace(
         Game=Game,
         Run=Run,
@@ -433,9 +355,6 @@ def make(
         weight=weight,
         horizon=horizon,
         first_agent=first_agent,
-        path_of=path_of,
-        trace=trace,
-        roll=roll,
         nearest_point=nearest_point,
         Array=Array,
         Numbers=Numbers,

@@ -11,7 +11,10 @@ from epo_lightning.solvers.gauss_newton.fused_kernel import expansion as expansi
 from epo_lightning.solvers.gauss_newton.fused_kernel import games as all_games
 from epo_lightning.solvers.gauss_newton.fused_kernel import layout, threads
 from epo_lightning.solvers.gauss_newton.fused_kernel import pair_adjoint as pair_adjoints
+from epo_lightning.solvers.gauss_newton.fused_kernel import pair_expansion as pair_expansions
 from epo_lightning.solvers.gauss_newton.fused_kernel import pairs as pair_features
+from epo_lightning.solvers.gauss_newton.fused_kernel import places as all_places
+from epo_lightning.solvers.gauss_newton.fused_kernel import position_adjoint as position_adjoints
 from epo_lightning.solvers.gauss_newton.fused_kernel import products as all_products
 from epo_lightning.solvers.gauss_newton.fused_kernel import recursion as recursions
 from epo_lightning.solvers.gauss_newton.fused_kernel import residuals as all_residuals
@@ -56,33 +59,26 @@ def make(
     own, pair = (len(features.own), len(features.pair)) if features else (len(OWN), PAIRS)
     fast = layout.fast(agents, own, pair, steps, double, count)
     basics = threads.make(T, agents, fast, backwards)
-    games = all_games.make(T, agents, features, steps, fast, basics, func)
+    games = all_games.make(T, agents, features, steps, basics, func)
+    trajectories = all_trajectories.make(T, basics, games, fast, func)
     pairs = pair_features.make(T, func)
     residuals = all_residuals.make(T, games)
-    expansion = expansions.make(T, basics, games, residuals, pairs, fast, func)
+    places = all_places.make(T, basics, games, fast, func)
+    expand_pairs = pair_expansions.make(T, basics, games, pairs, trajectories, places, func).expand_pairs
+    expansion = expansions.make(T, basics, games, residuals, trajectories, places, fast, func)
     totals = all_totals.make(T, basics, games)
     recursion = recursions.make(T, agents, fast, backwards)
-    trajectories = all_trajectories.make(T, basics, games, func)
     products = all_products.make(T, basics, games, func)
     pair_adjoint = pair_adjoints.make(T, basics, games, pairs, trajectories, products, func).pair_adjoint
+    position_adjoint = position_adjoints.make(T, basics, games, trajectories, products, func).position_adjoint
     adjoint = adjoints.make(T, basics, games, residuals, trajectories, products, func)
     sync, lane, fast_memory, fast_numbers = basics.sync, basics.lane, basics.fast_memory, basics.fast_numbers
     Game, Run, Gradients, part, set_up = games.Game, games.Run, games.Gradients, games.part, games.set_up
     pair_count = games.pair_count
-    end_of, valid, trace, roll, path_of, horizon = (
-        games.end_of,
-        games.valid,
-        games.trace,
-        games.roll,
-        games.path_of,
-        games.horizon,
-    )
-    copy_weights, expand_pairs, expand_controls, expand_states = (
-        expansion.copy_weights,
-        expansion.expand_pairs,
-        expansion.expand_controls,
-        expansion.expand_states,
-    )
+    end_of, valid, horizon = games.end_of, games.valid, games.horizon
+    path_of, trace, roll = trajectories.path_of, trajectories.trace, trajectories.roll
+    copy_weights = places.copy_weights
+    expand_controls, expand_states = expansion.expand_controls, expansion.expand_states
     total, squared_slope = totals.total, totals.squared_slope
     begin, add_slopes, eliminate, pull, push = (
         recursion.begin,
@@ -93,11 +89,7 @@ def make(
     )
     roll_tangents, pull_states = trajectories.roll_tangents, trajectories.pull_states
     forget_products, add_products = products.forget_products, products.add_products
-    position_adjoint, motion_adjoint, control_adjoint = (
-        adjoint.position_adjoint,
-        adjoint.motion_adjoint,
-        adjoint.control_adjoint,
-    )
+    motion_adjoint, control_adjoint = adjoint.motion_adjoint, adjoint.control_adjoint
     registers = 255 if double else REGISTERS[count]
     each_factor = layout.factor_numbers(agents)
     rows = 2 * agents

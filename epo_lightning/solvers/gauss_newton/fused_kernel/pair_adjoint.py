@@ -27,7 +27,7 @@ def make(
         trajectories.tangent,
         products.pair_product_place,
     )
-    Game, Layout, pair_index, trace = games.Game, games.Layout, games.pair_index, games.trace
+    Game, Layout, pair_index, trace = games.Game, games.Layout, games.pair_index, trajectories.trace
     pair_feature, pair_count, margin_slot = games.pair_feature, games.pair_count, games.margin_slot
     horizon, first_agent = games.horizon, games.first_agent
     Array, Numbers, A = games.Array, games.Numbers, games.agents

@@ -1,7 +1,5 @@
-"""Tangents of trajectories along changes of the controls, forwards in time, and the pullback of cotangents, backwards.
-
-Both are sums along time, as the trajectories of the unicycle are.
-"""
+"""Trajectories of the unicycle and their tangents along changes of the controls, forwards in time, and the pullback of
+cotangents, backwards. All of them are sums along time."""
 
 from types import SimpleNamespace
 from typing import Any, no_type_check
@@ -9,14 +7,78 @@ from typing import Any, no_type_check
 import warp as wp
 
 from epo_lightning.solvers.gauss_newton.fused_kernel.constants import COSINE, SINE, SPEED, TURN_RATE, TURNED, X, Y
+from epo_lightning.solvers.gauss_newton.fused_kernel.layout import Fast
 
 
 @no_type_check
-def make(T: Any, threads: SimpleNamespace, games: SimpleNamespace, func: Any) -> SimpleNamespace:
-    """The functions for numbers of type ``T``; ``func`` decorates the longer ones."""
-    sync, lane, sums, sums_back = threads.sync, threads.lane, threads.sums, threads.sums_back
-    Game, Gradients, Layout, trace = games.Game, games.Gradients, games.Layout, games.trace
+def make(T: Any, threads: SimpleNamespace, games: SimpleNamespace, fast: Fast, func: Any) -> SimpleNamespace:
+    """The functions for numbers of type ``T``, with fast memory for ``fast``; ``func`` decorates the longer ones."""
+    sync, lane, sums, sums_back, direction = (
+        threads.sync,
+        threads.lane,
+        threads.sums,
+        threads.sums_back,
+        threads.direction,
+    )
+    Game, Gradients, Layout = games.Game, games.Gradients, games.Layout
     Array, Numbers, A, horizon = games.Array, games.Numbers, games.agents, games.horizon
+    in_fast_memory = fast.path
+
+    if fast.path < 0:
+
+        @wp.func
+        def path_of(work: Array, fast: Array):
+            return work
+
+        @wp.func
+        def trace(at: Layout, K: int, quantity: int, i: int):
+            return at.path + (quantity * A + i) * (K + 1)
+
+    else:
+
+        @wp.func
+        def path_of(work: Array, fast: Array):
+            """The memory that holds the trajectories."""
+            return fast
+
+        @wp.func
+        def trace(at: Layout, K: int, quantity: int, i: int):
+            """Start of one quantity of agent i's trajectory in it."""
+            return in_fast_memory + (quantity * A + i) * (K + 1)
+
+    @func
+    def roll(g: Game, game: int, n: int, agents: Numbers, at: Layout, path: Array, controls: Array):
+        """Headings and speeds are sums of the controls along time, and positions are sums of the motions that follow.
+
+        The changes are summed on their own: added to a large coordinate, small ones would lose most of their digits.
+        """
+        K = horizon(g)
+        for e in range(lane(), 2 * n, wp.block_dim()):
+            i = e // 2
+            channel = e - 2 * i
+            row = (game // g.M) * g.N + agents[i]
+            turning = channel == TURN_RATE
+            start = g.initial[4 * row + wp.where(turning, 2, 3)]
+            to = trace(at, K, wp.where(turning, TURNED, SPEED), i)
+            sums(controls, (game * g.N + agents[i]) * K * 2 + channel, 2, K, start, g.dt, path, to)
+        sync()
+        for e in range(lane(), n * (K + 1), wp.block_dim()):
+            i = e // (K + 1)
+            k = e - i * (K + 1)
+            sine = trace(at, K, SINE, i) + k
+            cosine = trace(at, K, COSINE, i) + k
+            direction(path[trace(at, K, TURNED, i) + k], path, sine, cosine)
+            along = g.dt * path[trace(at, K, SPEED, i) + k]
+            path[trace(at, K, X, i) + k] = along * path[cosine]
+            path[trace(at, K, Y, i) + k] = along * path[sine]
+        sync()
+        for e in range(lane(), 2 * n, wp.block_dim()):
+            i = e // 2
+            axis = e - 2 * i
+            start = g.initial[4 * ((game // g.M) * g.N + agents[i]) + axis]
+            to = trace(at, K, wp.where(axis == 0, X, Y), i)
+            sums(path, to, 1, K, start, T(1.0), path, to)
+        sync()
 
     @wp.func
     def tangent(at: Layout, K: int, along_d: int, quantity: int, i: int):
@@ -105,6 +167,9 @@ def make(T: Any, threads: SimpleNamespace, games: SimpleNamespace, func: Any) ->
         sync()
 
     return SimpleNamespace(
+        path_of=path_of,
+        trace=trace,
+        roll=roll,
         tangent=tangent,
         roll_tangents=roll_tangents,
         along=along,
