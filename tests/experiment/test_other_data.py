@@ -17,7 +17,7 @@ from experiment import pedestrians, tiny
 from experiment.conftest import Epo
 
 from epo_lightning import cli
-from epo_lightning.data.recorded import recordings
+from epo_lightning.data.recorded import versions
 from epo_lightning.experiment.assembly import build_data
 from epo_lightning.experiment.config.compose import compose
 from epo_lightning.experiment.config.settings import Settings
@@ -272,7 +272,7 @@ def test_a_run_on_scenes_of_an_older_version_keeps_its_splits(
     words = ("data=ucy", f"data.folder={tmp_path / 'data'}", "data.val_share=0.3")
     assert epo("generate", *words, "workers=1", "progress=false") == 0
     assert epo("train", "experiment=ucy/const_vel", *words, *SMALL, "run_dir=run", "score=test") == 0
-    monkeypatch.setattr(recordings, "VERSION", recordings.VERSION + 1)
+    monkeypatch.setattr(versions, "VERSION", versions.VERSION + 1)
     assert epo("generate", *words, "workers=1", "progress=false") == 0
     message = refused("evaluate", "run=run")
     assert "were extracted from the same recordings by an older version of epo_lightning" in message

@@ -1,9 +1,11 @@
-"""The scenes of a split, gathered from those of its recordings, which need not fit in memory together."""
+"""The scenes of all splits, gathered from those of their recordings, which need not fit in memory together."""
 
 from __future__ import annotations
 
+import shutil
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -11,7 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from epo_lightning.data import cache
 from epo_lightning.data.recorded.extraction import Extracted
+from epo_lightning.data.recorded.parts import Parts
 from epo_lightning.data.recorded.summary import by_unit, describe
 from epo_lightning.data.recorded.tables import INDEX_OF, SceneTables, shifted
 
@@ -60,6 +64,39 @@ class Spool:
             full = 0 not in shape
             found[name] = np.memmap(file.name, like.dtype, "r+", shape=shape) if full else np.empty(shape, like.dtype)
         return found
+
+
+@contextmanager
+def gathered(
+    splits: Mapping[str, Sequence[str]],
+    tables: Mapping[str, SceneTables | None],
+    counts: Mapping[str, Mapping[str, int]],
+    extracted: Mapping[str, Extracted],
+    parts: Parts,
+) -> Iterator[tuple[dict[str, dict[str, Tensor]], dict[str, dict[str, Any]]]]:
+    """The scenes of every split and a report about them, as :func:`gather` gives them.
+
+    The tensors are in files beside the parts, which are deleted at the end of the context.
+
+    Args:
+        splits: names of the recordings of each split.
+        tables, counts, extracted: scenes, counts and outcome of each recording, as for :func:`gather`.
+        parts: the parts of the data set.
+
+    Raises:
+        OSError: the disk is full or read-only.
+    """
+    folder = parts.folder / "columns"
+    shutil.rmtree(folder, ignore_errors=True)  # files that a killed process left
+    try:
+        tensors, about = {}, {}
+        with cache.writing(folder):
+            for split, held in splits.items():
+                widest = max(parts.lanes(name) for name in held if counts[name].get("scenes"))
+                tensors[split], about[split] = gather(held, tables, counts, extracted, widest, folder / split)
+        yield tensors, about
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def gather(

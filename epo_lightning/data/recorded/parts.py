@@ -16,11 +16,11 @@ from safetensors import safe_open
 
 from epo_lightning.data.cache import CacheError
 from epo_lightning.data.recorded.duplicates import Drives
-from epo_lightning.data.recorded.extraction import RAW, Extracted, outcomes
+from epo_lightning.data.recorded.extraction import RAW, Extracted, extract_to_file, outcomes
 from epo_lightning.data.recorded.tables import SceneTables
 from epo_lightning.data.recorded.tracks import RecordingSource
 from epo_lightning.data.recorded.windows import WindowConfig
-from epo_lightning.data.workers import Report
+from epo_lightning.data.workers import Report, finished
 
 MOST = 10_000
 """Largest number of parts: file systems slow down with millions of files."""
@@ -64,6 +64,28 @@ class Parts:
     def tasks(self, windows: WindowConfig, has_map: bool, strict: bool, keep: bool) -> list[PartTask]:
         """The missing parts, each as the arguments of the function that extracts it."""
         return [(self.members[number], windows, has_map, self.files[number], strict, keep) for number in self.missing()]
+
+    def extract(self, tasks: Sequence[PartTask], workers: int | None, progress: bool, launch: Launch | None) -> None:
+        """Extract parts into their files.
+
+        Args:
+            tasks: the parts, see :meth:`tasks`.
+            workers: processes; None for one per core.
+            progress: whether to report progress.
+            launch: function that has the parts extracted by jobs elsewhere; None for processes of this machine.
+
+        Raises:
+            CacheError: a worker was killed.
+        """
+        unit, before = "recording" if self.size == 1 else "part", len(self.files) - len(tasks)
+        report = Report(tasks, lambda task: task[3], unit, "extracting", "extracted", before, progress)
+        if launch and tasks:
+            launch(tasks, report)
+        else:
+            for _ in finished(
+                extract_to_file, tasks, workers, report, f"finished recordings are kept in {self.folder}"
+            ):
+                pass
 
     def extracted(self) -> dict[str, Extracted]:
         """Outcome of every recording by name.

@@ -13,49 +13,36 @@ from typing import Any
 
 import numpy as np
 
+from epo_lightning.checks import check_choice
 from epo_lightning.data import cache
 from epo_lightning.data.datamodule import SceneDataModule, SceneDataset
 from epo_lightning.data.errors import RecordingError
 from epo_lightning.data.recorded import summary
 from epo_lightning.data.recorded.duplicates import used_once
-from epo_lightning.data.recorded.extraction import Extracted, extract_to_file
-from epo_lightning.data.recorded.gathering import gather
+from epo_lightning.data.recorded.extraction import Extracted
+from epo_lightning.data.recorded.gathering import gathered
 from epo_lightning.data.recorded.parts import Launch, Lazy, Parts
 from epo_lightning.data.recorded.routes import LINES, PER_LINE
 from epo_lightning.data.recorded.scenes import FRAMES, RecordedScenes
 from epo_lightning.data.recorded.sources import (
     absent,
     altered,
-    check_names,
     code_of,
     fingerprints,
+    listed,
     warn_of_copies,
     with_options,
 )
 from epo_lightning.data.recorded.splits import ALL, UNITS, SplitRule
 from epo_lightning.data.recorded.tables import selected
 from epo_lightning.data.recorded.tracks import RecordingSource
-from epo_lightning.data.recorded.windows import WindowConfig, identifying
-from epo_lightning.data.workers import Report, finished
+from epo_lightning.data.recorded.versions import DUPLICATES, identifying_settings, of_older_versions
+from epo_lightning.data.recorded.windows import WindowConfig
 from epo_lightning.metrics.functional.interaction import SUBSETS
-from epo_lightning.registry import ConfigError, nearest, register
+from epo_lightning.registry import ConfigError, register
 from epo_lightning.scene import SHAPES
 from epo_lightning.schema import read
 from epo_lightning.task import Task
-
-VERSION = 2
-"""Version of the extraction: raised whenever the same recordings would give other scenes.
-
-Version 2 has one exception: its reference lines were mended where an agent is beside the end of a lane. On simulated
-highways nine of 554,676 agents have lines that are moved, by at most 7 mm, on US-101 none; on Lankershim Boulevard, with
-three lines per agent, six of 8,407, by up to 27 cm.
-"""
-VERSION_OF_JUNCTIONS = 4
-"""The same for scenes with reference lines through junctions (``windows.lines``).
-
-The lines of version 2 were wrong beside the end of a lane; those of version 3 might begin far from the agent.
-"""
-DUPLICATES = ("keep", "once")
 
 
 @register("data", "recordings")
@@ -130,8 +117,7 @@ class RecordedData(SceneDataModule):
             ("shape", shape, SHAPES),
             ("duplicates", duplicates, DUPLICATES),
         ):
-            if choice not in known:
-                raise ConfigError(f"unknown data.{name} {choice!r}: {nearest(str(choice), known)}")
+            check_choice(f"data.{name}", choice, known)
         groups = None if test is None else tuple(str(group) for group in test)
         self.rule = SplitRule(groups, test_share, val_share, val_by, seed)
         self.duplicates = duplicates
@@ -159,19 +145,9 @@ class RecordedData(SceneDataModule):
         Raises:
             ConfigError: the folder is missing or holds no recording.
         """
-        folder = self.folder_of_recordings
-        if folder.is_file():
-            raise ConfigError(f"{folder} is a file: data.folder takes the folder that it lies in")
-        if not folder.is_dir():
-            raise ConfigError(
-                f"no folder {folder} with {self.dataset_name} recordings, and no data set that was extracted from such "
-                f"recordings in {self.root}: point data.folder at the recordings, or unpack them there"
-            )
-        found = sorted(self.list_sources(folder), key=lambda source: source.name)
-        if not found:
-            raise ConfigError(f"{folder} holds no recording in the format {self.format!r}: is it the right folder?")
-        check_names(found)
-        return found
+        return listed(
+            self.list_sources, self.folder_of_recordings, dataset=self.dataset_name, format=self.format, root=self.root
+        )
 
     def splits(self, sources: Sequence[RecordingSource]) -> dict[str, list[RecordingSource]]:
         """The recordings of each split.
@@ -240,18 +216,9 @@ class RecordedData(SceneDataModule):
 
     def _settings(self) -> dict[str, Any]:
         """The part of the data set's configuration that does not depend on the recordings."""
-        return {
-            "version": VERSION_OF_JUNCTIONS if self.task.map and self.windows.lines is not None else VERSION,
-            "dataset": self.dataset_name,
-            "format": self.format,
-            "windows": identifying(self.windows),
-            "map": self.task.map,
-            # Data sets without options keep the names that they had before formats had any.
-            **({"options": self.options} if self.options else {}),
-            **({"reader": self.reader} if self.reader else {}),
-            # A default is no part of the configuration, so that data sets of older versions keep theirs.
-            **({} if self.duplicates == "keep" else {"duplicates": self.duplicates}),
-        }
+        return identifying_settings(
+            self.dataset_name, self.format, self.windows, self.task.map, self.options, self.reader, self.duplicates
+        )
 
     def _config_of(self, sources: Sequence[RecordingSource], identity: Any, skipped: Any = ()) -> dict[str, Any]:
         """The configuration of a data set from ``sources``; ``skipped`` identifies recordings that could not be read."""
@@ -300,12 +267,7 @@ class RecordedData(SceneDataModule):
 
     def is_older(self, digest: str) -> bool:
         """Whether a digest is that of the same recordings, splits and settings, extracted by an older version."""
-        now = self.config["version"]
-        older = [{**self.config, "version": version} for version in range(1, now)]
-        if self.reader:  # older versions did not know the readers of own formats
-            without = {key: value for key, value in self.config.items() if key != "reader"}
-            older += [{**without, "version": version} for version in range(1, now + 1)]
-        return any(self._digest(config) == digest for config in older)
+        return any(self._digest(config) == digest for config in of_older_versions(self.config))
 
     @property
     def command(self) -> str:
@@ -359,13 +321,7 @@ class RecordedData(SceneDataModule):
             work.mkdir(parents=True, exist_ok=True)
         parts = Parts(work, recordings)
         tasks = parts.tasks(self.windows, self.task.map, strict, self.duplicates == "once")
-        unit, before = "recording" if parts.size == 1 else "part", len(parts.files) - len(tasks)
-        report = Report(tasks, lambda task: task[3], unit, "extracting", "extracted", before, progress)
-        if launch and tasks:
-            launch(tasks, report)
-        else:
-            for _ in finished(extract_to_file, tasks, workers, report, f"finished recordings are kept in {work}"):
-                pass
+        parts.extract(tasks, workers, progress, launch)
         if names := altered(identity, self.identity(recordings)):
             shutil.rmtree(work, ignore_errors=True)
             raise ConfigError(f"files of {names[0]} have changed while they were read: give the command again")
@@ -407,20 +363,11 @@ class RecordedData(SceneDataModule):
             tables = Lazy(tables.names, lambda name: selected(parts.tables(name), kept.get(name)))
         warned = {source.name: extracted[source.name].about.get("warnings", ()) for source in used}
         self.rule.refuse_empty(self.dataset_name, used, splits, counts, warned)
-        columns = parts.folder / "columns"
-        shutil.rmtree(columns, ignore_errors=True)  # files that a killed process left
-        try:
-            tensors, about = {}, {}
-            with cache.writing(columns):
-                for split, held in names.items():
-                    widest = max(parts.lanes(name) for name in held if counts[name].get("scenes"))
-                    tensors[split], about[split] = gather(held, tables, counts, extracted, widest, columns / split)
+        with gathered(names, tables, counts, extracted, parts) as (tensors, about):
             rows = summary.rows_of(sources, splits, extracted, counts)
             problems = {name: one.problem for name, one in extracted.items() if one.problem is not None}
             report = {**about, "recordings": names, **({"skipped": problems} if problems else {})}
             cache.write(self.folder, tensors, self.config, report, {summary.FILE: summary.to_csv(rows)})
-        finally:
-            shutil.rmtree(columns, ignore_errors=True)
 
     def report(self) -> dict[str, Any]:
         """The report that was written with the data set.

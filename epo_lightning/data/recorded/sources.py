@@ -83,6 +83,33 @@ def with_options(format: str, options: Mapping[str, Any]) -> Callable[[Path], li
     return partial(list_sources, **options)
 
 
+def listed(
+    list_sources: Callable[[Path], list[RecordingSource]], folder: Path, *, dataset: str, format: str, root: Path
+) -> list[RecordingSource]:
+    """The recordings of a folder, sorted by name.
+
+    Args:
+        list_sources: function that lists them, see :func:`with_options`.
+        folder: the folder.
+        dataset, format, root: name of the data set, name of its format and folder of the cache, for messages.
+
+    Raises:
+        ConfigError: the folder is missing or holds no recording, or the name of a file is not UTF-8.
+    """
+    if folder.is_file():
+        raise ConfigError(f"{folder} is a file: data.folder takes the folder that it lies in")
+    if not folder.is_dir():
+        raise ConfigError(
+            f"no folder {folder} with {dataset} recordings, and no data set that was extracted from such "
+            f"recordings in {root}: point data.folder at the recordings, or unpack them there"
+        )
+    found = sorted(list_sources(folder), key=lambda source: source.name)
+    if not found:
+        raise ConfigError(f"{folder} holds no recording in the format {format!r}: is it the right folder?")
+    _check_names(found)
+    return found
+
+
 def absent() -> Recording:
     """Stand-in for the reader of a recording whose files are absent.
 
@@ -138,7 +165,7 @@ def fingerprints(files: Sequence[Path], root: Path) -> dict[Path, list[Any]]:
     return {file: [file.name, size, checksum] for file, (size, _, checksum) in zip(files, entries, strict=True)}
 
 
-def check_names(sources: Sequence[RecordingSource]) -> None:
+def _check_names(sources: Sequence[RecordingSource]) -> None:
     """Refuse names that cannot be written.
 
     Raises:
