@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from data.recorded.formats.exid_files import read_tracks
 from pyproj import Transformer
 
-from epo_lightning.data.recorded.formats.exid_tables import read_tracks
 from epo_lightning.data.recorded.formats.lanelet2 import read_map
 from epo_lightning.data.recorded.lanes import SHOULDER, LaneGraph, Polylines, lane_changes
 from epo_lightning.data.simulate.lanelets import lanelets, write_map

@@ -9,8 +9,9 @@ import numpy as np
 import polars as pl
 import pytest
 import shapely
+from data.recorded.formats.exid_files import read_tracks, read_tracks_meta
 
-from epo_lightning.data.recorded.formats.exid_tables import TRACKS, read_tracks, read_tracks_meta
+from epo_lightning.data.recorded.formats.exid_tables import TRACKS
 from epo_lightning.data.recorded.lanes import lane_changes
 from epo_lightning.data.recorded.tracks import Recording
 from epo_lightning.data.simulate import realism, recording

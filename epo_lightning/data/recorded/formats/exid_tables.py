@@ -54,22 +54,3 @@ def read_table(
 ) -> pl.DataFrame:
     """Columns of a file of exiD by name and type, as :func:`~epo_lightning.data.recorded.formats.tables.read_table`."""
     return tables.read_table(path, types, required, optional, MISSING, TOLD_BY)
-
-
-def read_tracks(path: Path) -> pl.DataFrame:
-    """All columns of a tracks file in the types of :data:`TRACKS`, in that order; missing values are null.
-
-    Raises:
-        RecordingError: there is no such file, a column is missing or repeated, a row is cut off, or a text is not a number.
-    """
-    return read_table(path, TRACKS, USED)
-
-
-def read_tracks_meta(path: Path) -> pl.DataFrame:
-    """All columns of a tracksMeta file, as :func:`read_tracks`."""
-    return read_table(path, TRACKS_META, tuple(TRACKS_META))
-
-
-def read_recording_meta(path: Path) -> pl.DataFrame:
-    """All columns of a recordingMeta file, as :func:`read_tracks`."""
-    return read_table(path, RECORDING_META, ("recordingId", "locationId", "frameRate", "xUtmOrigin", "yUtmOrigin"))

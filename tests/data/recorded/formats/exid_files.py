@@ -1,4 +1,4 @@
-"""Small exiD folders and Lanelet2 maps, written by hand, and where the shared data are."""
+"""Small exiD folders and Lanelet2 maps, written by hand; whole tables of exiD, and where the shared data are."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ import numpy as np
 import polars as pl
 import pytest
 from pyproj import Transformer
+
+from epo_lightning.data.recorded.formats.exid_tables import RECORDING_META, TRACKS, TRACKS_META, USED, read_table
 
 ORIGIN = (351_000.0, 5_650_000.0)
 """Origin of the local frame in UTM zone 32 [m], near Cologne."""
@@ -29,6 +31,21 @@ def shared(name: str) -> Path:
     if not (folder / name).exists():
         pytest.skip(f"there is no {name} in {folder}: set EPO_SHARED to the folder that holds it")
     return folder / name
+
+
+def read_tracks(path: Path) -> pl.DataFrame:
+    """All columns of a tracks file, of which the reader of the format takes some; missing values are null."""
+    return read_table(path, TRACKS, USED)
+
+
+def read_tracks_meta(path: Path) -> pl.DataFrame:
+    """All columns of a tracksMeta file."""
+    return read_table(path, TRACKS_META, tuple(TRACKS_META))
+
+
+def read_recording_meta(path: Path) -> pl.DataFrame:
+    """All columns of a recordingMeta file."""
+    return read_table(path, RECORDING_META, ("recordingId", "locationId", "frameRate", "xUtmOrigin", "yUtmOrigin"))
 
 
 @dataclass

@@ -6,9 +6,18 @@ import numpy as np
 import polars as pl
 import pytest
 
-from data.recorded.formats.exid_files import SETTING, drive, meta_of, road, write
+from data.recorded.formats.exid_files import (
+    SETTING,
+    drive,
+    meta_of,
+    read_recording_meta,
+    read_tracks,
+    read_tracks_meta,
+    road,
+    write,
+)
 from epo_lightning.data.errors import RecordingError
-from epo_lightning.data.recorded.formats import exid_tables as reader
+from epo_lightning.data.recorded.formats.exid_tables import TRACKS
 from epo_lightning.data.recorded.formats.levelx import exid
 from epo_lightning.registry import lookup
 from epo_lightning.scene import KINDS
@@ -55,9 +64,9 @@ def test_files_may_lie_directly_in_the_folder(tmp_path):
 def test_all_columns_are_read(tmp_path):
     tracks = drive()
     write(tmp_path, tracks.select(reversed(tracks.columns)))
-    table = reader.read_tracks(tmp_path / "data" / "07_tracks.csv")
-    assert table.columns == list(reader.TRACKS) == tracks.columns
-    assert table.schema == dict(reader.TRACKS)
+    table = read_tracks(tmp_path / "data" / "07_tracks.csv")
+    assert table.columns == list(TRACKS) == tracks.columns
+    assert table.schema == dict(TRACKS)
     for name in tracks.columns[:18]:
         assert table[name].to_list() == tracks[name].to_list(), name
     first, second, fourth = table.row(0, named=True), table.row(1, named=True), table.row(3, named=True)
@@ -75,9 +84,9 @@ def test_all_columns_are_read(tmp_path):
     assert {second[name] for name in ("leadDHW", "leadDV", "leadId")} == {None}
     assert (second["latLaneCenterOffset"], second["odrLaneId"]) == ([-1.0], -1), "-1 is a value in both"
     assert (second["lonLaneletPos"], second["laneletLength"]) == ([4.0], [100.0])
-    meta = reader.read_tracks_meta(tmp_path / "data" / "07_tracksMeta.csv")
+    meta = read_tracks_meta(tmp_path / "data" / "07_tracksMeta.csv")
     assert meta.to_dicts()[1]["class"] == "truck"
-    setting = reader.read_recording_meta(tmp_path / "data" / "07_recordingMeta.csv")
+    setting = read_recording_meta(tmp_path / "data" / "07_recordingMeta.csv")
     assert setting.row(0, named=True) == SETTING
 
 
@@ -85,9 +94,9 @@ def test_optional_columns_may_be_absent(tmp_path):
     absent = {"odrRoadId", "odrSectionNo", "odrLaneId"}
     setting = {key: value for key, value in SETTING.items() if key != "exportVersion"}
     write(tmp_path, drive().drop(absent), setting=setting)
-    table = reader.read_tracks(tmp_path / "data" / "07_tracks.csv")
-    assert set(reader.TRACKS) - set(table.columns) == absent
-    assert "exportVersion" not in reader.read_recording_meta(tmp_path / "data" / "07_recordingMeta.csv").columns
+    table = read_tracks(tmp_path / "data" / "07_tracks.csv")
+    assert set(TRACKS) - set(table.columns) == absent
+    assert "exportVersion" not in read_recording_meta(tmp_path / "data" / "07_recordingMeta.csv").columns
     assert len(read(tmp_path).tracks) == 36
 
 
