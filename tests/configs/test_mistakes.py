@@ -1,0 +1,281 @@
+"""Every mistake in a command line or in a file of the tree is refused in one message that names the right word."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from experiment.conftest import Epo, epo, refused  # noqa: F401 - fixtures
+
+from epo_lightning.experiment.config.compose import compose, jobs
+from epo_lightning.registry import ConfigError
+
+MISTAKES = {
+    "trian": "'train'",
+    "train sede=1": "'seed'",
+    "train +sede=1": "'seed'",
+    "train data.batch=1": "'batch_size'",
+    "train +data.foo=1": "data.foo",
+    "train solver.step=3": "'steps'",
+    "train trainer.max_epoch=3": "'max_epochs'",
+    "train +callbacks.patient=3": "'patience'",
+    "train experiment=rpi/v_lst": "'rpi/v_lstm'",
+    "train forecaster=epos": "'epo'",
+    "train forecaster.name=epos": "'epo'",
+    "train logger=[wand]": "'wandb'",
+    "train energy.own=[gaol]": "'goal'",
+    "train seed=one": "seed must be a whole number",
+    "train optimizer.lr=fast": "optimizer.lr must be a number",
+    "train forecaster.modes=1.5": "forecaster.modes must be a whole number",
+    "train goal=some": "goal must be one of energy, all",
+    "train seed=${nope}": "nope",
+    "train ~energy": "energy",
+    "train foo": "key=value",
+    "train forecaster=scene_consistent objective.power=2": "write +forecaster.power=2",
+    "train forecaster=marginal objective.weights.imitation=2": "write forecaster.loss_weights.imitation=2",
+    "train forecaster=scene_consistent objective=laplace": "takes no objective: leave it out",
+    "train forecaster=constant_velocity objective.power=2": "takes no objective: leave it out",
+    "train forecaster=marginal energy=exid": "energy=exid has no effect on forecaster=marginal, which takes no energy",
+    "train forecaster=scene_consistent solver.steps=4": "which takes no solver: leave it out",
+    "train -m forecaster=epo,scene_consistent backward=implicit": "takes no backward: leave it out",
+    "train experiment=rpi/v_lstm_epo +energy=exid": "leave out the plus: energy=exid",
+    "train forecaster=marginal ~solver.steps": "~solver.steps has no effect on forecaster=marginal",
+    "train -m forecaster=epo,scene_consistent objective.relaxation=0.1": "write forecaster.relaxation=0.1",
+    "train objective.power=2 +objective.annealing=0.3": "exclude each other",
+    "train forecaster=scene_consistent +forecaster.power=2 +forecaster.annealing=0.3": "exclude each other",
+    "train forecaster=constant_velocity goal=all": "has no network of its own: use goal=energy",
+    "train backbone.width=0": "backbone.width=0",
+    "train optimizer.lr=-1": "optimizer.lr",
+    "train seed=0,1": "--multirun",
+    "train seed=-1": "seed",
+    "train trainer.max_epochs=null": "would never end",
+    "train -m sweeps=rpi_mein": "'rpi_main'",
+    "train -m solver.steps=1,x": "solver.steps must be a whole number",
+    "train --multrun": "'--multirun'",
+    "train experimnt=rpi/v_lstm": "did you mean 'experiment'?",
+    "train debug.foo=1": "needs a choice of debug",
+    "predict solver=game": "solver is a choice of epo train, and a run keeps it",
+    "report dat=x": "unknown key 'dat'",
+    "train seed = 1": "without blanks",
+    "train resume=nowhere": "does not exist",
+    "config chekc": "'check'",
+    "config check solver.step=3": "'steps'",
+    "config check generate workers=0": "workers",
+    "evaluate": "run=<run folder>",
+    "evaluate run=nowhere": "does not exist",
+    "evaluate runs=.": "no finished run",
+    "evaluate run=a split=tset": "split must be one of test, val, train, all or null",
+    "evaluate run=a split=train": "split=train needs data=<data set>",
+    "predict": "run=<run folder>",
+    "report runs=nowhere": "nowhere",
+    "report -m runs=a,b": "has no option -m",
+    "generate worker=3": "'workers'",
+    "generate -m data.solver=potential,feedback hydra/sweeper=optuna": "takes lists of values",
+}
+
+
+@pytest.mark.parametrize("words", MISTAKES)
+def test_invalid_configurations_are_refused_in_one_message(words: str, refused: Callable[..., str]) -> None:  # noqa: F811
+    verb, *rest = words.split()
+    data = ["data=tiny"] if verb == "train" and "resume" not in words else []
+    assert MISTAKES[words] in refused(verb, *data, *rest)
+
+
+def test_a_training_of_nothing_in_particular_is_refused(refused: Callable[..., str]) -> None:  # noqa: F811
+    assert "choose what to train: experiment=<row>" in refused("train")
+
+
+@pytest.mark.parametrize(
+    ("row", "hint"),
+    [
+        ("us101/v_lstm_ep", "did you mean 'us101/v_lstm_epo'? known: us101/const_vel, us101/hivt_m, "),
+        ("v_lstm_epo", "known: argoverse2/..., dut/..., exid/..., "),
+    ],
+)
+def test_a_mistyped_row_is_answered_by_the_rows_beside_it(row: str, hint: str, refused: Callable[..., str]) -> None:  # noqa: F811
+    message = refused("train", f"experiment={row}")
+    assert hint in message
+    assert "did you mean" in message
+    assert len(message) < 800
+
+
+def test_missing_data_is_reported_before_a_folder_is_made(refused: Callable[..., str]) -> None:  # noqa: F811
+    assert "epo generate" in refused("train", "experiment=rpi/v_lstm", "data.root=nowhere")
+
+
+def test_file_system_errors_give_one_message(epo: Epo, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:  # noqa: F811
+    (tmp_path / "file").touch()
+    assert epo("generate", "data=rpi_reduced", "data.root=file/cache", "progress=false") == 1
+    message = capsys.readouterr().err.strip()
+    assert message.startswith("epo: cannot write (Not a directory)"), message
+    assert message.endswith("file/cache"), message
+
+
+def test_a_check_without_the_data_says_in_one_line_what_is_missing(
+    epo: Epo,  # noqa: F811
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert epo("config", "check", "experiment=exid/v_lstm_epo", "data.folder=nowhere", "data.root=empty") == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.startswith(
+        "epo: V-LSTM + EPO: the settings fit together, but the data cannot be used: no folder"
+    )
+    assert "nowhere with exid recordings" in printed.err
+    assert printed.err.endswith("point data.folder at the recordings, or unpack them there\n")
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "words", "message"),
+    [
+        (
+            "experiment/mine.yaml",
+            "defaults: [rpi/v_lstm, _self_]",
+            "experiment=mine",
+            "mine.yaml must begin with the line `# @",
+        ),
+        (
+            "experiment/mine.yaml",
+            "# @package _global_\ndefaults: [rpi/v_lstm, {/backbone: hivt_m}]",
+            "experiment=mine",
+            r"in the defaults list of /.*experiment/mine\.yaml.*`- override /backbone: hivt_m`, with the slash",
+        ),
+        (
+            "experiment/rpi/mine.yaml",
+            "# @package _global_\ndefaults: [/experiment/rpi/v_lstm, {override backbone: hivt_m}]",
+            "experiment=rpi/mine",
+            r"in the defaults list of /.*experiment/rpi/mine\.yaml.*`- override /backbone: <option>`, with the slash",
+        ),
+        (
+            "experiment/mine.yaml",
+            "# @package _global_\ndefaults: [_self_, rpi/v_lstm]\ntitle: mine",
+            "experiment=mine",
+            r"in the defaults list of /.*experiment/mine\.yaml, `- _self_` stands before `- rpi/v_lstm`, .* `- _self_` last",
+        ),
+        (
+            "experiment/mine.yaml",
+            "# @package _global_\ndefaults: [_self_, {/experiment/rpi: v_lstm}]\ntitle: mine",
+            "experiment=mine",
+            r"`- _self_` stands before `- /experiment/rpi`",
+        ),
+        (
+            "experiment/mine.yaml",
+            "# @package _global_\ndefaults: [rpi/v_lstm, override /backbone hivt_m, _self_]",
+            "experiment=mine",
+            r"experiment/mine\.yaml, `- override /backbone hivt_m` lacks a colon",
+        ),
+        (
+            "experiment/mine.yaml",
+            "title: mine",
+            "experiment=mine",
+            "mine.yaml must begin with the line `# @package _glo",
+        ),
+        ("experiment/mine.yaml", b"\xe9: 1", "experiment=mine", r"experiment/mine\.yaml is not YAML: 'utf-8' codec"),
+        (
+            "sweeps/mine.yaml",
+            "# @package _global_\nhydra: {sweeper: {parms: {seed: '0,1'}}}",
+            "sweeps=mine",
+            r"sweeps/mine\.yaml has an unknown key 'parms' under hydra: a sweep's values stand in hydra\.sweeper\.params",
+        ),
+        (
+            "sweeps/mine.yaml",
+            "hydra: {sweeper: {params: {seed: '0,1'}}}",
+            "sweeps=mine",
+            r"sweeps/mine\.yaml must begin with the line `# @package _global_`, as every file in sweeps/ does",
+        ),
+        ("sweeps/mine.yaml", "", "sweeps=mine", r"sweeps/mine\.yaml must begin with the line `# @package _global_`"),
+        (
+            "budget/mine.yaml",
+            "budget: {name: mine}",
+            "budget=mine",
+            r"budget/mine\.yaml must begin with the line `# @pack",
+        ),
+        (
+            "backbone/mine.yaml",
+            "name: v_lstm\n  width: 3",
+            "backbone=mine",
+            r"backbone/mine\.yaml:2 is not YAML: mapping",
+        ),
+    ],
+)
+def test_mistakes_in_files_of_the_tree_are_named(
+    tmp_path: Path, file: str, content: str | bytes, words: str, message: str
+) -> None:
+    (tmp_path / file).parent.mkdir(parents=True)
+    (tmp_path / file).write_bytes(content.encode() if isinstance(content, str) else content)
+    with pytest.raises(ConfigError, match=message):
+        compose("train", [words], [str(tmp_path)])
+
+
+@pytest.mark.parametrize(
+    ("params", "message"),
+    [
+        (
+            "experiment: [rpi/v_lstm_sc, rpi/v_lstm_epo]",
+            r"params: experiment=\['rpi/v_lstm_sc', 'rpi/v_lstm_epo'\] is a list.* write rpi/v_lstm_sc,rpi/v_lstm_epo with",
+        ),
+        ("seed: 0;1", r"params: cannot read `seed: 0;1`, expected a value, or several with commas .*: `seed: a,b`"),
+        (
+            "optimizer: {lr: '1e-3,1e-4'}",
+            r"params: optimizer is a section, expected dotted keys .*: write `optimizer\.lr: 1e-3,1e-4`",
+        ),
+        ("energy: 0;1", r"params: cannot read `energy: 0;1`"),
+    ],
+)
+def test_mistakes_in_the_values_of_a_sweep_are_named(
+    tmp_path: Path,
+    refused: Callable[..., str],  # noqa: F811
+    params: str,
+    message: str,
+) -> None:
+    file = tmp_path / "conf" / "sweeps" / "mine.yaml"
+    file.parent.mkdir(parents=True)
+    file.write_text(f"# @package _global_\nhydra:\n  sweeper:\n    params:\n      {params}\n")
+    said = refused("sweep", "mine", f"--config-dir={tmp_path / 'conf'}", "data=tiny", "budget=smoke")
+    assert re.search(rf"/sweeps/mine\.yaml, hydra\.sweeper\.{message}", said)
+
+
+def test_a_list_of_options_is_no_mixture_of_them(refused: Callable[..., str]) -> None:  # noqa: F811
+    several = "experiment=[rpi/v_lstm_sc,rpi/v_lstm_epo]"
+    for words in (("train",), ("config", "check"), ("train", "-m"), ("sweep", "rpi_main")):
+        said = refused(*words, several, "data=tiny", "budget=smoke")
+        assert "write rpi/v_lstm_sc,rpi/v_lstm_epo without brackets" in said
+    assert "without brackets" in refused("evaluate", "run=x", "data=[tiny,drawn]")
+    compose("train", ["experiment=rpi/v_lstm_sc", "logger=[csv,tensorboard]"])
+
+
+def test_settings_of_a_row_of_own_that_the_budget_replaces_are_refused(
+    tmp_path: Path,
+    refused: Callable[..., str],  # noqa: F811
+) -> None:
+    conf = tmp_path / "conf"
+    params = "{experiment: rpi/mine, optimizer.lr: '1e-3,1e-4'}"
+    own = "optimizer: {lr: 3.0e-4, clip: 1}\ndata: {batch_size: 8}"
+    for folder, text in {
+        "experiment/rpi/mine": f"defaults: [/experiment/rpi/v_lstm, _self_]\n{own}",
+        "experiment/rpi/other": "defaults: [/experiment/rpi/mine, _self_]\ntitle: other",
+        "budget/mine": "budget: {name: mine}\noptimizer: {lr: 3.0e-4}",
+        "sweeps/mine": f"hydra: {{sweeper: {{params: {params}}}}}\ndata: {{batch_size: 32}}",
+    }.items():
+        (conf / folder).parent.mkdir(parents=True, exist_ok=True)
+        (conf / f"{folder}.yaml").write_text(f"# @package _global_\n{text}\n")
+    said = (
+        r"/experiment/rpi/mine\.yaml sets optimizer\.lr: 0\.0003, data\.batch_size: 8 without effect: the budget's file "
+        r".*conf/budget/short\.yaml is read later and sets optimizer\.lr: 0\.001, data\.batch_size: 32; with this budget, "
+        r"move such settings to the command line \(optimizer\.lr=0\.0003 data\.batch_size=8\), to the file of a sweep"
+    )
+    words = (f"--config-dir={conf}", "data=tiny")
+    for row in ("mine", "other"):
+        for verb in (("train",), ("config", "check"), ("sweep", "rpi_main")):
+            assert re.search(said, refused(*verb, *words, f"experiment=rpi/{row}", "budget=short"))
+
+    def learning_rate(*words: str) -> float:
+        return compose("train", ["experiment=rpi/other", *words], [str(conf)])["optimizer"]["lr"]
+
+    assert learning_rate("budget=mine") == 3e-4
+    assert learning_rate("budget=short", "optimizer.lr=1e-3", "data.batch_size=32") == 1e-3
+    assert learning_rate("budget=smoke") == 1e-3, "a budget for trials is small whatever else is written"
+    listed = jobs("train", ["sweeps=mine", "budget=short"], [str(conf)])
+    assert [compose("train", job, [str(conf)])["optimizer"]["lr"] for job in listed] == [1e-3, 1e-4]
