@@ -25,9 +25,10 @@ from torch.autograd.function import once_differentiable
 from epo_lightning.forecast import GameParameters, Solution, Status
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import Scene
+from epo_lightning.solvers.gauss_newton import kernel_games
 from epo_lightning.solvers.gauss_newton.game_arrays import GameArrays, as_type
 from epo_lightning.solvers.gauss_newton.kernel import interface
-from epo_lightning.solvers.gauss_newton.kernel.interface import MOST_AGENTS, OWN, PAIR, Address, EpoGame, EpoRun
+from epo_lightning.solvers.gauss_newton.kernel.interface import MOST_AGENTS, Address, EpoGame, EpoRun
 from epo_lightning.solvers.gauss_newton.recorded_steps import take_steps
 from epo_lightning.solvers.general import descent
 
@@ -42,18 +43,9 @@ def obstacle(energy: FeatureEnergy, scene: Scene, parameters: GameParameters) ->
 
 def unsupported(energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> str | None:
     """Reason why the kernel cannot solve a game whose tensors are on the CPU, or are copied there; None where it can."""
-    controls = parameters.initial_controls
-    if controls.dtype not in (torch.float32, torch.float64):
-        return f"the compiled layer takes float32 and float64, not {controls.dtype}"
-    if energy.dynamics.integrator != "euler":
-        return f"the compiled layer integrates by euler, not {energy.dynamics.integrator}"
-    for name in (*energy.own, *energy.pair):
-        if name not in (*OWN, *PAIR):
-            return f"the compiled layer does not know the feature {name!r}"
-    if energy.bounded_by_kind:
-        return f"the compiled layer takes bounds of all agents, not bounds of {energy.bounded_by_kind[0]!r} by kind"
-    if scene.agent_mask.shape[1] > MOST_AGENTS:
-        return f"the compiled layer takes up to {MOST_AGENTS} agents, not {scene.agent_mask.shape[1]}"
+    reason = kernel_games.unknown(energy, scene, parameters, MOST_AGENTS, "the compiled layer", plural=False)
+    if reason is not None:
+        return reason
     library = interface.find()
     return f"the compiled layer is missing: {library}" if isinstance(library, str) else None
 

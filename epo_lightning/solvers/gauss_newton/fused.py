@@ -20,7 +20,8 @@ from torch import Tensor
 from epo_lightning.forecast import GameParameters, Solution
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import Scene
-from epo_lightning.solvers.gauss_newton.kernel.interface import OWN, PAIR, SIGNALS
+from epo_lightning.solvers.gauss_newton import kernel_games
+from epo_lightning.solvers.gauss_newton.kernel.interface import SIGNALS
 from epo_lightning.solvers.gauss_newton.recorded_steps import take_steps
 from epo_lightning.warp_kernels import described, installed, launch, warp
 
@@ -41,22 +42,13 @@ LONGEST = 2**31 - 1
 def obstacle(energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> str | None:
     """Reason why the fused kernels cannot solve a game; None where they can."""
     controls = parameters.initial_controls
-    agents = scene.agent_mask.shape[1]
     if not installed():
         return "the fused kernels need NVIDIA Warp: pip install 'epo_lightning[gpu]'"
     if controls.device.type not in ("cpu", "cuda"):
         return f"the fused kernels run on CUDA devices and CPUs, and these tensors are on {controls.device}"
-    if controls.dtype not in (torch.float32, torch.float64):
-        return f"the fused kernels take float32 and float64, not {controls.dtype}"
-    if energy.dynamics.integrator != "euler":
-        return f"the fused kernels integrate by euler, not {energy.dynamics.integrator}"
-    for name in (*energy.own, *energy.pair):
-        if name not in (*OWN, *PAIR):
-            return f"the fused kernels do not know the feature {name!r}"
-    if energy.bounded_by_kind:
-        return f"the fused kernels take bounds of all agents, not bounds of {energy.bounded_by_kind[0]!r} by kind"
-    if agents > SIZES[-1]:
-        return f"the fused kernels take up to {SIZES[-1]} agents, not {agents}"
+    reason = kernel_games.unknown(energy, scene, parameters, SIZES[-1], "the fused kernels", plural=True)
+    if reason is not None:
+        return reason
     lines = scene.references if "lane" in energy.own else None
     if max(2 * controls.numel(), 0 if lines is None else lines.numel()) > LONGEST:
         return "the fused kernels count states and points of lines in 32 bits, and this batch has too many: split it"
