@@ -100,7 +100,8 @@ def attach(
     As in :func:`.compiled.attach`, the factors are those of one undamped step from the solution, in float64.
     """
     start, none = controls.double(), controls.new_zeros(controls.shape[:2], dtype=torch.float64)
-    game = _Game.of(energy, scene.to(torch.float64), parameters.to(torch.float64), 1.0, none, exact)
+    parameters = dataclasses.replace(parameters.to(torch.float64), initial_controls=start)
+    game = _Game.of(energy, scene.to(torch.float64), parameters, 1.0, none, exact)
     call = game.call(start, 1)
     found, status = _Minimum.apply(game, call, start, *game.weights, *call.inputs)
     return found.to(controls.dtype), status

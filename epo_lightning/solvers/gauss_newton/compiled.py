@@ -43,7 +43,7 @@ def obstacle(energy: FeatureEnergy, scene: Scene, parameters: GameParameters) ->
 
 def unsupported(energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> str | None:
     """Reason why the kernel cannot solve a game whose tensors are on the CPU, or are copied there; None where it can."""
-    reason = kernel_games.unknown(energy, scene, parameters, MOST_AGENTS, "the compiled layer", plural=False)
+    reason = kernel_games.unknown(energy, scene, parameters, MOST_AGENTS, "the compiled layer")
     if reason is not None:
         return reason
     library = interface.find()

@@ -43,15 +43,15 @@ def obstacle(energy: FeatureEnergy, scene: Scene, parameters: GameParameters) ->
     """Reason why the fused kernels cannot solve a game; None where they can."""
     controls = parameters.initial_controls
     if not installed():
-        return "the fused kernels need NVIDIA Warp: pip install 'epo_lightning[gpu]'"
+        return "the fused layer needs NVIDIA Warp: pip install 'epo_lightning[gpu]'"
     if controls.device.type not in ("cpu", "cuda"):
-        return f"the fused kernels run on CUDA devices and CPUs, and these tensors are on {controls.device}"
-    reason = kernel_games.unknown(energy, scene, parameters, SIZES[-1], "the fused kernels", plural=True)
+        return f"the fused layer runs on CUDA devices and CPUs, and these tensors are on {controls.device}"
+    reason = kernel_games.unknown(energy, scene, parameters, SIZES[-1], "the fused layer")
     if reason is not None:
         return reason
     lines = scene.references if "lane" in energy.own else None
     if max(2 * controls.numel(), 0 if lines is None else lines.numel()) > LONGEST:
-        return "the fused kernels count states and points of lines in 32 bits, and this batch has too many: split it"
+        return "the fused layer counts states and points of lines in 32 bits, and this batch has too many: split it"
     return None
 
 

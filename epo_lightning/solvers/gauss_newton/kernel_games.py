@@ -11,12 +11,7 @@ from epo_lightning.solvers.gauss_newton.kernel.interface import OWN, PAIR
 
 
 def unknown(
-    energy: FeatureEnergy,
-    scene: Scene,
-    parameters: GameParameters,
-    most_agents: int,
-    kernel: str,
-    plural: bool,
+    energy: FeatureEnergy, scene: Scene, parameters: GameParameters, most_agents: int, kernel: str
 ) -> str | None:
     """Reason why a kernel does not know a game; None if it does.
 
@@ -24,19 +19,17 @@ def unknown(
         energy, scene, parameters: the game.
         most_agents: largest number of agents of the kernel's games.
         kernel: the subject of the reason, such as "the compiled layer".
-        plural: whether the subject is a plural.
     """
-    s, does = ("", "do") if plural else ("s", "does")
     dtype, agents = parameters.initial_controls.dtype, scene.agent_mask.shape[1]
     if dtype not in (torch.float32, torch.float64):
-        return f"{kernel} take{s} float32 and float64, not {dtype}"
+        return f"{kernel} takes float32 and float64, not {dtype}"
     if energy.dynamics.integrator != "euler":
-        return f"{kernel} integrate{s} by euler, not {energy.dynamics.integrator}"
+        return f"{kernel} integrates by euler, not {energy.dynamics.integrator}"
     for name in (*energy.own, *energy.pair):
         if name not in (*OWN, *PAIR):
-            return f"{kernel} {does} not know the feature {name!r}"
+            return f"{kernel} does not know the feature {name!r}"
     if energy.bounded_by_kind:
-        return f"{kernel} take{s} bounds of all agents, not bounds of {energy.bounded_by_kind[0]!r} by kind"
+        return f"{kernel} takes bounds of all agents, not bounds of {energy.bounded_by_kind[0]!r} by kind"
     if agents > most_agents:
-        return f"{kernel} take{s} up to {most_agents} agents, not {agents}"
+        return f"{kernel} takes up to {most_agents} agents, not {agents}"
     return None

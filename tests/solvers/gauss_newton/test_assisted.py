@@ -216,7 +216,9 @@ def test_derivatives_of_minima_equal_those_of_dense_matrices(agents, pair, exact
     found = []
     for attach in (implicit.attach, dense.attach):
         leaves = leaves_of(parameters)
-        controls, status = attach(energy, scene, leaves, minimum.controls, exact)
+        # The descent may have begun from the same controls in all modes.
+        begun = dataclasses.replace(leaves, initial_controls=leaves.initial_controls[:, :1])
+        controls, status = attach(energy, scene, begun, minimum.controls, exact)
         assert torch.equal(controls.detach(), minimum.controls)
         (controls * weigh).sum().backward()
         found.append((status, gradients(leaves)))

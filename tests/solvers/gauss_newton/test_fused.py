@@ -127,7 +127,7 @@ def test_games_that_the_kernels_do_not_solve_are_refused(monkeypatch):
     scene = random_scene(2, 2, history=2)
     game, energy = random_game(scene), FeatureEnergy(["acc"], dynamics=Unicycle("heun"))
     with pytest.raises(
-        ValueError, match="backend is 'warp', but the fused kernels integrate by euler, not heun; 'auto' and"
+        ValueError, match="backend is 'warp', but the fused layer integrates by euler, not heun; 'auto' and"
     ):
         backends.choose("warp", energy, scene, game)
     wide = random_scene(1, 9, history=2)
@@ -141,7 +141,7 @@ def test_games_that_the_kernels_do_not_solve_are_refused(monkeypatch):
     with pytest.raises(ConfigError, match=r"solver\.backend=warp has no Newton steps: set solver\.newton_steps=0"):
         LevenbergMarquardt(backend="warp", adaptive=True, newton_steps=2)
     monkeypatch.setattr(fused, "installed", lambda: False)
-    with pytest.raises(ValueError, match=r"the fused kernels need NVIDIA Warp: pip install 'epo_lightning\[gpu\]'"):
+    with pytest.raises(ValueError, match=r"the fused layer needs NVIDIA Warp: pip install 'epo_lightning\[gpu\]'"):
         backends.choose("warp", FeatureEnergy(["acc"]), scene, game)
 
 
