@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import difflib
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -16,6 +17,8 @@ Types = Mapping[str, pl.DataType]
 
 INT, FLOAT, FLAG, TEXT = pl.Int64(), pl.Float64(), pl.Boolean(), pl.String()
 INTS, FLOATS = pl.List(INT), pl.List(FLOAT)
+COMPRESSED = (b"\x1f\x8b", b"PK\x03\x04")
+"""First bytes of files of gzip and zip."""
 
 
 def read_table(
@@ -42,6 +45,7 @@ def read_table(
         data = path.read_bytes().rstrip(b"\r\n")
     except OSError as error:
         raise RecordingError(path, f"the file cannot be read: {error.strerror}") from error
+    _check_text(path, data)
     header, _, body = data.partition(b"\n")
     names = [name.strip(' \r"') for name in header.decode("utf-8-sig", errors="replace").split(",")]
     if not body:
@@ -50,7 +54,9 @@ def read_table(
         if names.count(name) > 1:
             raise RecordingError(path, f"there are {names.count(name)} columns called {name}: keep one of them")
         if name not in names and name not in optional:
-            close = difflib.get_close_matches(name, set(names) - set(types), n=1)
+            others = sorted(set(names) - set(types))
+            close = [other for other in others if other.lower() == name.lower()]
+            close = close or difflib.get_close_matches(name, others, n=1)
             raise RecordingError(path, f"there is no column {name}" + (f"; is it {close[0]!r}?" if close else ""))
     _check_fields(path, data, body, len(names))
     present = [name for name in types if name in names]
@@ -70,6 +76,23 @@ def read_table(
         for name, other in told_by.items()
         if name in present and other in present
     )
+
+
+def _check_text(path: Path, data: bytes) -> None:
+    """Check that a file is text in UTF-8 whose first line has fields separated by commas."""
+    if data.startswith(COMPRESSED):
+        raise RecordingError(path, "it is compressed: unpack it, for instance with gunzip or unzip")
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        raise RecordingError(path, "it is text in UTF-16: save it as UTF-8")
+    header, _, body = data.partition(b"\n")
+    if not body and b"\r" in header:
+        raise RecordingError(path, "its lines end with carriage returns alone: save it with line feeds at their ends")
+    for separator, name in ((b";", "semicolons"), (b"\t", "tabs")):
+        if separator in header and b"," not in header:
+            raise RecordingError(
+                path,
+                f"its columns are separated by {name}: save it with commas between them, and with points in numbers",
+            )
 
 
 def _check_fields(path: Path, data: bytes, body: bytes, expected: int) -> None:

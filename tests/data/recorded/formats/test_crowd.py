@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import gzip
 from pathlib import Path
 
 import numpy as np
@@ -207,3 +208,25 @@ def test_the_real_clips_are_read():
         check(recording, folder, source.name)
         agents += len(recording.tracks.ids)
     assert agents == 989
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (gzip.compress, r"it is compressed: unpack it"),
+        (lambda text: text.decode().encode("utf-16"), r"it is text in UTF-16: save it as UTF-8"),
+        (lambda text: text.replace(b",", b";"), r"its columns are separated by semicolons: save it with commas"),
+        (lambda text: text.replace(b",", b"\t"), r"its columns are separated by tabs: save it with commas"),
+        (
+            lambda text: text.replace(b"\n", b"\r"),
+            r"its lines end with carriage returns alone: save it with line feeds",
+        ),
+        (lambda text: text.replace(b"x_est", b"X_EST", 1), r"there is no column x_est; is it 'X_EST'\?"),
+    ],
+)
+def test_tables_that_are_saved_in_another_way_are_named_as_such(tmp_path, change, said):
+    (source,) = crowd(write(tmp_path))
+    table = next(file for file in source.files if "_ped_" in file.name)
+    table.write_bytes(change(table.read_bytes()))
+    with pytest.raises(RecordingError, match=rf"{table.name}: {said}"):
+        source.read()
