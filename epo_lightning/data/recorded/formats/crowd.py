@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -30,6 +31,10 @@ DUT_RATE = 23.976
 """Frames per second of DUT's videos [Hz]; CITR has 29.97."""
 VEHICLES = 1_000_000
 """Added to the ids of vehicles, which are counted separately from those of pedestrians."""
+OFFSET = {"ped": 0, "veh": VEHICLES}
+"""Added to the ids of a table, by label."""
+MOST = {"ped": 1.25, "veh": 2.0}
+"""Largest factor between displacements and velocities, in the median, by label: the speeds of cars lag behind."""
 LATEST = 10**9
 """Largest frame number."""
 SLOWEST = 0.3
@@ -94,17 +99,39 @@ def _source(name: str, tables: dict[str, Path], rate: float) -> RecordingSource:
 
 def _read_recording(name: str, group: str, tables: dict[str, Path], rate: float) -> Recording:
     dropped: Counter[str] = Counter({f"clips without a table of {NAMES[of]}": 1 for of in NAMES if of not in tables})
-    parts = [_rows(path, label) for label, path in tables.items()]
-    id, frame, position, velocity, heading = (np.concatenate(column) for column in zip(*parts, strict=True))
+    # Pedestrians come first, because their ids are below those of vehicles.
+    parts = [_numbered(_tracks(tables[label], label, rate), label) for label in NAMES if label in tables]
+    agents = np.cumsum([0, *(len(part.ids) for part in parts[:-1])])
+    tracks = TrackTable(
+        rate=rate,
+        agent=np.concatenate([part.agent + before for part, before in zip(parts, agents, strict=True)]),
+        frame=np.concatenate([part.frame for part in parts]),
+        position=np.concatenate([part.position for part in parts]),
+        heading=np.concatenate([part.heading for part in parts]),
+        velocity=np.concatenate([part.velocity for part in parts]),
+        ids=np.concatenate([part.ids for part in parts]),
+        size=np.concatenate([part.size for part in parts]),
+        kind=np.concatenate([part.kind for part in parts]),
+    )
+    return Recording(name, group, tracks, lanes=None, dropped=dict(dropped))
+
+
+def _numbered(tracks: TrackTable, label: str) -> TrackTable:
+    """The tracks with the ids that they have in a recording."""
+    return replace(tracks, ids=tracks.ids + OFFSET[label])
+
+
+def _tracks(path: Path, label: str, rate: float) -> TrackTable:
+    """The tracks of one table, checked by themselves: vehicles are few among pedestrians, and errors name file and id."""
+    id, frame, position, velocity, heading = _rows(path, label)
     order = np.lexsort((frame, id))
     ids, agent = np.unique(id[order], return_inverse=True)
-    kind = np.where(ids < VEHICLES, KINDS.index("pedestrian"), KINDS.index("car"))
     position, velocity, heading = position[order], velocity[order], heading[order]
-    walking = np.isnan(heading)
-    heading[walking] = direction_of_motion(agent[walking], velocity[walking], SLOWEST)
+    kind = np.full(len(ids), KINDS.index("pedestrian" if label == "ped" else "car"))
     size = typical_sizes(kind)
-    size[kind == KINDS.index("pedestrian")] = PEDESTRIAN
-    path = tables.get("ped", tables.get("veh", Path(name)))
+    if label == "ped":
+        heading = direction_of_motion(agent, velocity, SLOWEST)
+        size[:] = PEDESTRIAN
     tracks = TrackTable(
         rate=rate,
         agent=agent,
@@ -117,9 +144,17 @@ def _read_recording(name: str, group: str, tables: dict[str, Path], rate: float)
         kind=kind,
     ).check(path)
     check_motion(
-        tracks, path, "the velocities", f"{rate:g} frames per second (data.options.rate)", 0.5, 2.0, FASTEST, "radians"
+        tracks,
+        path,
+        "vx_est and vy_est" if label == "ped" else "psi_est and vel_est",
+        f"{rate:g} frames per second (data.options.rate)",
+        0.5,
+        2.0,
+        FASTEST,
+        "radians",
+        most=MOST[label],
     )
-    return Recording(name, group, tracks, lanes=None, dropped=dict(dropped))
+    return tracks
 
 
 def _rows(path: Path, label: str) -> _Rows:
@@ -140,11 +175,11 @@ def _rows(path: Path, label: str) -> _Rows:
             )
     position = _y_up(table, "x_est", "y_est")
     if label == "ped":
-        # Pedestrians are marked by a heading of NaN until their tracks are sorted.
-        return _Rows(id, frame, position, _y_up(table, "vx_est", "vy_est"), np.full(len(id), np.nan))
+        # The heading of a pedestrian follows from its velocities when its track is sorted.
+        return _Rows(id, frame, position, _y_up(table, "vx_est", "vy_est"), np.zeros(len(id)))
     heading, speed = -table["psi_est"].to_numpy(), table["vel_est"].to_numpy()
     velocity = speed[:, None] * np.stack([np.cos(heading), np.sin(heading)], 1)
-    return _Rows(id + VEHICLES, frame, position, velocity, heading)
+    return _Rows(id, frame, position, velocity, heading)
 
 
 def _y_up(table: pl.DataFrame, x: str, y: str) -> np.ndarray:

@@ -69,12 +69,13 @@ def check_motion(
         most: largest factor between displacements and velocities, in the median.
 
     Raises:
-        RecordingError: an agent jumps, displacements and velocities differ by a factor, or headings do not point along the
-            directions of motion.
+        RecordingError: an agent jumps, displacements and velocities differ by a factor or in direction, or headings do not
+            point along the directions of motion.
     """
     within = np.flatnonzero(np.diff(table.agent) == 0)
     elapsed = np.diff(table.frame)[within] / table.rate
-    travelled = np.linalg.norm(table.position[within + 1] - table.position[within], axis=1) / elapsed
+    way = (table.position[within + 1] - table.position[within]) / elapsed[:, None]
+    travelled = np.linalg.norm(way, axis=1)
     speed = np.linalg.norm(table.velocity, axis=1)
     if (jumps := travelled > fastest).any():
         row = within[jumps][0]
@@ -91,13 +92,28 @@ def check_motion(
             path,
             f"positions move {ratio:.3g} times as fast as {velocity} say: they were expected in m and m/s, at {rate}",
         )
+    mean = 0.5 * (table.velocity[within] + table.velocity[within + 1])
+    clear = (travelled > moving) & (np.linalg.norm(mean, axis=1) > moving)
+    if clear.any():
+        aside = _median_angle(np.arctan2(*way[clear].T[::-1]), np.arctan2(*mean[clear].T[::-1]))
+        if aside > np.pi / 4:
+            raise RecordingError(
+                path,
+                f"positions move in another direction than {velocity} say, by {np.rad2deg(aside):.0f} degrees in the "
+                "median: have both the same axes, and are angles in the right unit?",
+            )
     rows = speed > fast
     if rows.any():
         course = np.arctan2(table.velocity[rows, 1], table.velocity[rows, 0])
-        aside = float(np.median(np.abs((table.heading[rows] - course + np.pi) % (2 * np.pi) - np.pi)))
+        aside = _median_angle(table.heading[rows], course)
         if aside > np.pi / 4:
             raise RecordingError(
                 path,
                 f"headings differ by {np.rad2deg(aside):.0f} degrees from the directions of motion: "
                 f"{unit} counter-clockwise from x were expected",
             )
+
+
+def _median_angle(one: Float[np.ndarray, " n"], other: Float[np.ndarray, " n"]) -> float:
+    """The median of the angles between directions [rad]."""
+    return float(np.median(np.abs((one - other + np.pi) % (2 * np.pi) - np.pi)))

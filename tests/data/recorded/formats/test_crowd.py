@@ -230,3 +230,47 @@ def test_tables_that_are_saved_in_another_way_are_named_as_such(tmp_path, change
     table.write_bytes(change(table.read_bytes()))
     with pytest.raises(RecordingError, match=rf"{table.name}: {said}"):
         source.read()
+
+
+def crowded(folder: Path, change) -> Path:
+    """A clip with many pedestrians and two cars, after a change of the text of the table of cars."""
+    table = vehicles(frames=60)
+    changed = change(table)
+    assert changed != table
+    return write(folder, ped=pedestrians(30, 60), veh=changed)
+
+
+def scaled(text: str, columns: dict[str, float]) -> str:
+    """A table with some columns multiplied by a number."""
+    header, *rows = [line.split(",") for line in text.splitlines()]
+    factors = [columns.get(name, 1.0) for name in header]
+    found = [
+        [cell if factor == 1.0 else repr(factor * float(cell)) for cell, factor in zip(row, factors, strict=True)]
+        for row in rows
+    ]
+    return "\n".join(",".join(row) for row in [header, *found]) + "\n"
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda text: scaled(text, {"x_est": 1e-3, "y_est": 1e-3}), "positions move 0.001 times as fast as psi_est"),
+        (lambda text: scaled(text, {"vel_est": 3.6}), "positions move 0.278 times as fast as psi_est and vel_est say"),
+        (lambda text: scaled(text, {"psi_est": 180 / np.pi}), "positions move in another direction than psi_est and"),
+        (lambda text: scaled(text, {"vel_est": -1.0}), "positions move in another direction than .* say, by 180 deg"),
+        (lambda text: text.replace("x_est,y_est", "y_est,x_est"), "positions move in another direction than psi_est"),
+    ],
+)
+def test_a_mistake_in_the_table_of_cars_is_not_hidden_by_many_pedestrians(tmp_path, change, said):
+    folder = crowded(tmp_path, change)
+    with pytest.raises(RecordingError, match=rf"^{folder}/square_01_traj_veh_filtered.csv: {said}"):
+        read(folder)
+
+
+def test_errors_of_tracks_name_the_file_and_the_id_in_it(tmp_path):
+    def repeated(text: str) -> str:
+        return text + text.splitlines()[-1] + "\n"
+
+    folder = crowded(tmp_path / "cars", repeated)
+    with pytest.raises(RecordingError, match=r"square_01_traj_veh_filtered.csv: track 1 has frame 62 twice"):
+        read(folder)
