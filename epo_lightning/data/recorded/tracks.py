@@ -63,15 +63,16 @@ class TrackTable:
         """Speed along the heading [m/s], negative when reversing."""
         return self.velocity[:, 0] * np.cos(self.heading) + self.velocity[:, 1] * np.sin(self.heading)
 
-    def check(self, path: Path | str) -> TrackTable:
+    def check(self, path: Path | str, fastest: float = FASTEST) -> TrackTable:
         """This table, after a check that its numbers are plausible.
 
         Args:
             path: path of the file, for error messages.
+            fastest: speed [m/s] that no agent exceeds from one of its rows to the next.
 
         Raises:
             RecordingError: no rows, numbers of another type or that are not finite, implausible units, or an agent whose
-                frames do not increase.
+                frames do not increase or that jumps.
         """
 
         def first(bad: Any) -> int:
@@ -120,6 +121,16 @@ class TrackTable:
                     f"{name} {values[row].tolist()} of track {self.ids[self.agent[row]]} in frame {self.frame[row]} was "
                     f"expected to be finite and at most {limit:g} {unit}: is it in another unit?",
                 )
+        way = np.linalg.norm(np.diff(self.position, axis=0), axis=1)
+        jumps = (by_agent == 0) & (way * self.rate > fastest * np.diff(self.frame))
+        if jumps.any():
+            row = first(jumps)
+            raise RecordingError(
+                path,
+                f"track {self.ids[self.agent[row]]} jumps from {self.position[row].tolist()} to "
+                f"{self.position[row + 1].tolist()} m after its frame {self.frame[row]}: agents stay below {fastest:g} m/s; "
+                "is its id that of two agents, or a position wrong?",
+            )
         bad = ~np.all((self.size > 0) & (self.size <= LONGEST), axis=1)
         if bad.any():
             agent = first(bad)

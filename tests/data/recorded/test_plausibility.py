@@ -113,3 +113,15 @@ def test_tracks_that_are_not_sorted_by_agent_are_refused() -> None:
         RecordingError, match=r"frame 0 of track 0 comes after frames of track 1: tracks are sorted by agent"
     ):
         dataclasses.replace(tracks, agent=(tracks.agent + 1) % 2).check("walking.csv")
+
+
+def test_a_track_that_jumps_is_refused_in_every_format() -> None:
+    position = walking().position.copy()
+    position[50:] += 100.0
+    with pytest.raises(
+        RecordingError, match=r"track 1 jumps from \[.*\] to \[.*\] m after its frame 9: agents stay below"
+    ):
+        dataclasses.replace(walking(), position=position).check("walking.csv")
+    apart = np.where(np.arange(AGENTS * STEPS) >= 50, walking().frame + 100, walking().frame)
+    apart[2 * STEPS :] = walking().frame[2 * STEPS :]
+    dataclasses.replace(walking(), position=position, frame=apart).check("walking.csv")

@@ -142,7 +142,7 @@ def _tracks(path: Path, label: str, rate: float) -> TrackTable:
         ids=ids,
         size=size,
         kind=kind,
-    ).check(path)
+    ).check(path, FASTEST)
     check_motion(
         tracks,
         path,
@@ -150,7 +150,6 @@ def _tracks(path: Path, label: str, rate: float) -> TrackTable:
         f"{rate:g} frames per second (data.options.rate)",
         0.5,
         2.0,
-        FASTEST,
         "radians",
         most=MOST[label],
     )

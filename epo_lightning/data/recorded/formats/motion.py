@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from epo_lightning.data.errors import RecordingError
-from epo_lightning.data.recorded.tracks import FASTEST, TrackTable
+from epo_lightning.data.recorded.tracks import TrackTable
 
 
 def unwrapped(heading: Float[np.ndarray, " T"], agent: Int[np.ndarray, " T"]) -> Float[np.ndarray, " T"]:
@@ -51,7 +51,6 @@ def check_motion(
     rate: str,
     moving: float = 2.0,
     fast: float = 5.0,
-    fastest: float = FASTEST,
     unit: str = "degrees",
     most: float = 1.25,
 ) -> None:
@@ -64,26 +63,18 @@ def check_motion(
         rate: name of the frame rate and its file, for error messages.
         moving: speed [m/s] above which displacements are compared with velocities.
         fast: speed [m/s] above which headings are compared with directions of motion.
-        fastest: speed [m/s] that no agent reaches.
         unit: unit of headings in the file, for error messages.
         most: largest factor between displacements and velocities, in the median.
 
     Raises:
-        RecordingError: an agent jumps, displacements and velocities differ by a factor or in direction, or headings do not
-            point along the directions of motion.
+        RecordingError: displacements and velocities differ by a factor or in direction, or headings do not point along the
+            directions of motion.
     """
     within = np.flatnonzero(np.diff(table.agent) == 0)
     elapsed = np.diff(table.frame)[within] / table.rate
     way = (table.position[within + 1] - table.position[within]) / elapsed[:, None]
     travelled = np.linalg.norm(way, axis=1)
     speed = np.linalg.norm(table.velocity, axis=1)
-    if (jumps := travelled > fastest).any():
-        row = within[jumps][0]
-        raise RecordingError(
-            path,
-            f"track {table.ids[table.agent[row]]} jumps from {table.position[row].tolist()} to "
-            f"{table.position[row + 1].tolist()} m after its frame {table.frame[row]}: vehicles stay below {fastest:g} m/s",
-        )
     stated = 0.5 * (speed[within] + speed[within + 1])
     faster = np.maximum(travelled, stated) > moving
     ratio = float(np.median(travelled[faster] / np.maximum(stated[faster], 1e-3))) if faster.any() else 1.0

@@ -159,7 +159,7 @@ def test_options_decide_on_the_data_set_and_unknown_ones_are_refused(tmp_path):
         (pedestrians().replace("1,3,ped", "-1,3,ped"), None, "row 11: id is -1; 0 .. 999999 was expected"),
         (pedestrians().replace("1,3,ped", "1,4,ped"), None, "track 1 has frame 4 twice"),
         (None, vehicles().replace("30.0", "inf", 1), r"veh_filtered.csv, row 3: x_est is inf; a finite number"),
-        (None, vehicles(speed=90.0), "jumps from .* vehicles stay below 40 m/s"),
+        (None, vehicles(speed=90.0), "jumps from .* agents stay below 40 m/s"),
         (None, vehicles(speed=90.0, frames=1), None),
         (pedestrians(2) + pedestrians(2).split("\n", 1)[1], None, "track 0 has frame 1 twice"),
     ],
