@@ -43,7 +43,9 @@ def test_tracks_without_a_mistake_are_not_doubted() -> None:
     assert not doubts(walking())
     turns = dataclasses.replace(walking(), heading=walking().heading + 4 * math.pi)
     assert not doubts(turns)
-    assert not doubts(dataclasses.replace(walking(), velocity=0.0 * walking().velocity)), "agents that stand"
+    still = np.repeat(walking().position[::STEPS], STEPS, 0)
+    stand = dataclasses.replace(walking(), position=still, velocity=0.0 * walking().velocity)
+    assert not doubts(stand), "agents that stand"
 
 
 def test_agents_that_accelerate_between_frames_are_not_doubted() -> None:
@@ -113,6 +115,62 @@ def test_tracks_that_are_not_sorted_by_agent_are_refused() -> None:
         RecordingError, match=r"frame 0 of track 0 comes after frames of track 1: tracks are sorted by agent"
     ):
         dataclasses.replace(tracks, agent=(tracks.agent + 1) % 2).check("walking.csv")
+
+
+def driving() -> TrackTable:
+    """Cars on a road along x, which bends a little."""
+    tracks = walking()
+    time = tracks.frame / RATE
+    heading = 0.02 + 0.01 * time
+    velocity = 10.0 * np.stack((np.cos(heading), np.sin(heading)), -1)
+    ahead = np.stack((np.sin(heading), -np.cos(heading)), -1) / 0.01 * 10.0
+    return dataclasses.replace(
+        tracks,
+        position=ahead + 5.0 * tracks.agent[:, None],
+        heading=heading,
+        velocity=velocity,
+        kind=np.full(AGENTS, KINDS.index("car")),
+    )
+
+
+@pytest.mark.parametrize(
+    ("turn", "said"),
+    [
+        (np.deg2rad, "taken as radians where degrees were expected"),
+        (np.negative, "better if they are taken as clockwise: by"),
+    ],
+)
+def test_headings_in_a_wrong_unit_or_sense_are_doubted_also_on_a_straight_road(
+    turn: Callable[[np.ndarray], np.ndarray], said: str
+) -> None:
+    assert not doubts(driving())
+    (doubt,) = doubts(dataclasses.replace(driving(), heading=turn(driving().heading)))
+    assert re.search(said, doubt)
+
+
+def test_mistakes_of_few_agents_of_a_kind_are_named() -> None:
+    """One car among five pedestrians."""
+    tracks = walking()
+    kind = np.where(np.arange(AGENTS) == 0, KINDS.index("car"), tracks.kind)
+    mixed = dataclasses.replace(tracks, kind=kind)
+    assert not doubts(mixed)
+    factor = np.where(tracks.agent == 0, 3.6, 1.0)[:, None]
+    (doubt,) = doubts(dataclasses.replace(mixed, velocity=factor * tracks.velocity))
+    assert doubt.startswith("agents of the kind car move 0.28 times as fast in their positions as their velocities say")
+
+
+def test_velocities_of_zero_are_doubted_if_agents_move() -> None:
+    (doubt,) = doubts(dataclasses.replace(walking(), velocity=0.0 * walking().velocity))
+    assert re.search(r"agents that move 5 m or more have velocities near zero: are the velocities missing", doubt)
+
+
+def test_a_jump_that_a_car_could_do_is_doubted() -> None:
+    position = walking().position.copy()
+    position[45:80] += 8.0
+    (doubt,) = doubts(dataclasses.replace(walking(), position=position).check("walking.csv"))
+    assert doubt.startswith(
+        "1 steps of tracks end more than 3 m from where their velocities lead, the first one after frame 4"
+    )
 
 
 def test_a_track_that_jumps_is_refused_in_every_format() -> None:
