@@ -88,6 +88,8 @@ def places(path: Path) -> tuple[list[Place], RecordingError | None]:
     try:
         with path.open("rb", buffering=0) as file:
             size, at = path.stat().st_size, 0
+            if not size:
+                return found, RecordingError(path, "it is empty: fetch the file again")
             while at < size:
                 file.seek(at)
                 header = file.read(HEADER.size)

@@ -19,6 +19,8 @@ from epo_lightning.data.recorded.tracks import Recording, RecordingError, Record
 from epo_lightning.registry import ConfigError, register
 from epo_lightning.scene import KINDS
 
+NAME = "obsmat.txt"
+"""Name of the file of every recording."""
 VIDEO_RATE = 25.0
 """Frames per second of most videos [Hz]."""
 COLUMNS = ("frame", "pedestrian", "x", "z", "y", "vx", "vz", "vy")
@@ -57,12 +59,13 @@ def ucy(folder: Path, video_rate: float | None = None) -> list[RecordingSource]:
         raise ConfigError(
             f"data.options.video_rate must be frames per second, between 1 and 1000, or null, not {video_rate!r}"
         )
-    paths = sorted(path for path in Path(folder).rglob("obsmat.txt") if path.is_file())
+    # Links to nowhere are kept, which a pattern without a star skips: no recording must be left out in silence.
+    paths = sorted(path for path in Path(folder).rglob("obsmat*") if path.name == NAME and not path.is_dir())
     if not paths:
         raise RecordingError(folder, "there is no obsmat.txt in this folder or below it")
     first: dict[str, Path] = {}
     for path in paths:
-        name = path.resolve().parent.name
+        name = path.parent.resolve().name
         if name in first:
             raise RecordingError(path, f"{first[name]} is in a folder of the same name: rename one of the two")
         first[name] = path
@@ -168,7 +171,7 @@ def _video_rate(
 def _table(path: Path) -> Float[np.ndarray, "T 8"]:
     """The numbers of a file, checked."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise RecordingError(path, f"the file cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
@@ -178,7 +181,9 @@ def _table(path: Path) -> Float[np.ndarray, "T 8"]:
     rows = [(row, line.split()) for row, line in enumerate(text.split("\n"), 1) if line.strip()]
     for row, cells in rows:
         if len(cells) != len(COLUMNS):
-            raise RecordingError(path, f"there are {len(cells)} columns; {', '.join(COLUMNS)} were expected", row)
+            raise RecordingError(
+                path, f"there are {len(cells)} columns; {', '.join(COLUMNS)} were expected, separated by spaces", row
+            )
     table = np.array([[_number(cell) for cell in cells] for _, cells in rows])
     bad = ~np.isfinite(table)
     bad[:, :2] |= (np.abs(table[:, :2]) > LARGEST) | (table[:, :2] != np.rint(table[:, :2]))

@@ -292,6 +292,15 @@ def test_scenes_that_overlap_are_grouped(tmp_path):
     assert all(source.read().group == source.group for source in sources)
 
 
+def test_a_link_to_nowhere_is_refused_and_a_folder_is_no_scenario(tmp_path):
+    (tmp_path / "a.xml").write_text(SCENARIO)
+    (tmp_path / "folder.xml").mkdir()
+    assert [source.name for source in commonroad(tmp_path)] == ["a"]
+    (tmp_path / "b.xml").symlink_to(tmp_path / "none")
+    with pytest.raises(RecordingError, match=r"b.xml: the file cannot be read: No such file"):
+        commonroad(tmp_path)
+
+
 def test_invalid_folders_are_refused(tmp_path):
     with pytest.raises(RecordingError, match="there is no CommonRoad scenario"):
         commonroad(tmp_path)

@@ -53,7 +53,10 @@ def test_a_cut_file_is_listed_up_to_the_cut(tmp_path):
     whole = waymo_files.write(tmp_path, contents).read_bytes()
     size = len(whole) // 4
     path = tmp_path / "cut"
-    for length in range(len(whole)):
+    path.write_bytes(b"")
+    found, error = places(path)
+    assert (found, str(error)) == ([], f"{path}: it is empty: fetch the file again")
+    for length in range(1, len(whole)):
         path.write_bytes(whole[:length])
         found, error = places(path)
         assert len(found) == length // size

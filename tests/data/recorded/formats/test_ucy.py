@@ -164,6 +164,27 @@ def test_invalid_folders_are_refused(tmp_path):
         ucy(tmp_path)
 
 
+def test_a_byte_order_mark_is_no_number(tmp_path):
+    expected = read(tmp_path).tracks
+    marked = read(tmp_path, b"\xef\xbb\xbf" + ROWS.lstrip("\n").encode()).tracks
+    np.testing.assert_array_equal(marked.position, expected.position)
+
+
+def test_links_are_recordings_of_their_own_folder_and_those_to_nowhere_are_refused(tmp_path):
+    target = write(tmp_path / "store", ROWS)
+    home = tmp_path / "home"
+    for name, to in (("linked", target), ("nowhere", tmp_path / "none"), ("loop", Path("obsmat.txt"))):
+        (home / name).mkdir(parents=True)
+        (home / name / "obsmat.txt").symlink_to(to)
+    (home / "folder" / "obsmat.txt").mkdir(parents=True)
+    sources = {source.name: source for source in ucy(home)}
+    assert list(sources) == ["linked", "loop", "nowhere"]
+    assert len(sources["linked"].read().tracks) == 6
+    for name in ("loop", "nowhere"):
+        with pytest.raises(RecordingError, match=f"{name}/obsmat.txt: the file cannot be read"):
+            sources[name].read()
+
+
 @pytest.mark.skipif(not SHARED.is_dir(), reason=f"no recordings of UCY in {SHARED}")
 def test_the_real_recordings_are_read():
     recordings = {source.name: source.read() for source in ucy(SHARED)}

@@ -215,6 +215,18 @@ def test_folders_without_shards_and_shards_of_one_name_are_refused(tmp_path):
         waymo(tmp_path)
 
 
+def test_an_empty_shard_and_a_link_to_nowhere_are_refused(tmp_path):
+    write(tmp_path, [scenario()], "a.tfrecord")
+    (tmp_path / "b.tfrecord").write_bytes(b"")
+    whole, empty = waymo(tmp_path)
+    assert len(whole.read().tracks)
+    with pytest.raises(RecordingError, match=r"b.tfrecord: it is empty: fetch the file again"):
+        empty.read()
+    (tmp_path / "c.tfrecord").symlink_to(tmp_path / "none")
+    with pytest.raises(RecordingError, match=r"c.tfrecord: the file cannot be read: No such file"):
+        waymo(tmp_path)
+
+
 def states(*changed, count=91):
     """States of a standing car, some of which are replaced."""
     found = [state(float(k), 0.0, 0.0, 10.0) for k in range(count)]
