@@ -14,6 +14,10 @@ TOO_SHORT = "in a track shorter than a window"
 """Name of a count: windows whose agent is observed in a stretch that is shorter than a window."""
 
 
+MOST_BETWEEN = 20
+"""Largest number of steps of a clock from one frame of a recording to the next."""
+
+
 @dataclass(frozen=True)
 class Stretches:
     """States of agents at steps of a common clock. Row ``start + s - first`` of a stretch is its state at step s.
@@ -74,12 +78,19 @@ def stretches(
         number of windows in those that were left out.
 
     Raises:
-        ConfigError: the clock is faster than the recording, without ``interpolate``.
+        ConfigError: the clock is faster than the recording, without ``interpolate``, or more than ``MOST_BETWEEN`` times as
+            fast.
     """
     if dt * tracks.rate < 1 - 1e-6 and not interpolate:
         raise ConfigError(
             f"data.windows.dt={dt} asks for more than the recording's {tracks.rate:g} frames per second: "
             f"use {1 / tracks.rate:g} or more, or data.windows.interpolate=true"
+        )
+    if dt * tracks.rate * MOST_BETWEEN < 1 - 1e-6:
+        least = np.ceil(1e4 / (MOST_BETWEEN * tracks.rate)) / 1e4
+        raise ConfigError(
+            f"data.windows.dt={dt} asks for more than {MOST_BETWEEN} steps between two of the recording's {tracks.rate:g} "
+            f"frames per second: use {least:g} or more"
         )
     rows = len(tracks)
     new = np.append(True, (np.diff(tracks.agent) != 0) | (np.diff(tracks.frame) != 1))[:rows]

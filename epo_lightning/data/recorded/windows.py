@@ -36,8 +36,8 @@ STANDING = 2.0
 """Speed [m/s] up to which a vehicle may be parked."""
 MOST_BESIDE = 0.5
 """Largest share of positions of moving vehicles on no lane; above it, the map does not belong to the tracks."""
-MOST_AGENTS, MOST_LINES, LONGEST_SMOOTHING = 64, 64, 10.0
-"""Largest numbers of agents of a scene and of lines of an agent, and largest length [s] of the smoothing window."""
+MOST_AGENTS, MOST_LINES, MOST_LANES, LONGEST_SMOOTHING = 64, 64, 4096, 10.0
+"""Largest numbers of agents of a scene, lines of an agent and lane polylines, and largest length [s] of smoothing."""
 MOMENTS, AT_ENDS = "agents at steps of the clock", "near the beginning or end of a track"
 """Names of counts: possible windows, one per agent and step, and those whose agent is not observed in the whole window."""
 REASONS = ("too few agents around", "the same agents twice", "no lane change", "an agent on no lane")
@@ -108,6 +108,10 @@ class WindowConfig:
             value = getattr(self, name)
             if value is not None and not 0 < value < np.inf:
                 raise ConfigError(f"data.windows.{name} must be positive, or null for none, not {value}")
+        if self.lanes is not None and self.lanes > MOST_LANES:
+            raise ConfigError(
+                f"data.windows.lanes must be {MOST_LANES} or less, or null for all that an agent may reach, not {self.lanes}"
+            )
         if self.lines is not None and self.lines > MOST_LINES:
             raise ConfigError(f"data.windows.lines must be {MOST_LINES} or less, not {self.lines}")
         if self.agents > MOST_AGENTS:

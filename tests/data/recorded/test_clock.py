@@ -123,6 +123,14 @@ def test_a_clock_faster_than_the_recording_is_refused():
         stretches(traffic(curve(None), FOUR), 0.02, None, 1)
 
 
+def test_a_clock_that_is_much_faster_than_the_recording_is_refused_before_it_fills_the_memory():
+    with pytest.raises(
+        ConfigError, match=r"more than 20 steps between two of the recording's 7 frames .* use 0\.0072 or"
+    ):
+        stretches(walk(0, 7.0, [40]), 1e-6, None, 1, interpolate=True)
+    assert len(stretches(walk(0, 7.0, [40]), 0.0072, None, 1, interpolate=True)[0].state)
+
+
 @given(
     st.integers(0, 10_000),
     st.sampled_from([(2.5, 0.2), (2.5, 0.1), (2.5, 0.25), (23.98, 0.2), (7.0, 0.5), (25.0, 0.1)]),

@@ -392,6 +392,7 @@ def test_joined_scenes_are_the_same_scenes():
     ("key", "value", "message"),
     [
         ("agents", 65, "agents must be 64 or less"),
+        ("lanes", 10**6, "lanes must be 4096 or less, or null for all that an agent may reach"),
         ("horizon", 1, "horizon must be 2 or more"),
         ("smoothing", 1e9, "smoothing must be 10 s or less"),
         ("history", 1, "data.windows.history must be 2 or more"),
