@@ -95,7 +95,7 @@ def _extract(
             for doubt in doubts(recording.tracks):
                 warnings.warn(doubt, stacklevel=1)
             if has_map and recording.lanes is None:
-                raise ConfigError(f"the recording {source.name} has no map: set data.map=false, or give it one")
+                raise RecordingError(source.name, "the recording has no map: set data.map=false, or give it one")
             if not has_map:
                 recording = dataclasses.replace(recording, lanes=None)
             found, counts = extract(recording, windows)
@@ -121,14 +121,20 @@ def _read(source: RecordingSource) -> Recording:
     """The recording.
 
     Raises:
-        RecordingError: as its reader raises it, or in the place of an exception in which the reader fails.
+        RecordingError: as its reader raises it, or in the place of an exception in which the reader fails; or implausible
+            tracks or lanes of a reader that did not check them.
     """
+    place = source.files[0] if source.files else source.name
     try:
-        return source.read()
+        found = source.read()
+        if len(found.tracks):
+            found.tracks.check(place)
+        if found.lanes is not None:
+            found.lanes.check(place)
+        return found
     except (ConfigError, OSError, MemoryError):
         raise
     except Exception as error:
-        place = source.files[0] if source.files else source.name
         what = f"{type(error).__name__}: {' '.join(str(error).split())}"[:400]
         raise RecordingError(place, f"its reader fails, {what}") from error
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +28,17 @@ from epo_lightning.registry import ConfigError, register
 
 from .roads import FOUR, curve, recording
 
+CHANGES = {
+    "mapless": lambda found: dataclasses.replace(found, lanes=None),
+    "unchecked": lambda found: dataclasses.replace(
+        found, tracks=dataclasses.replace(found.tracks, velocity=np.nan * found.tracks.velocity)
+    ),
+    "uneven": lambda found: dataclasses.replace(
+        found, tracks=dataclasses.replace(found.tracks, frame=found.tracks.frame[:-5])
+    ),
+}
+"""Mistakes of a format of one's own, which follow the road's turn in a file."""
+
 
 @register("format", "streets")
 def streets(folder: Path) -> list[RecordingSource]:
@@ -40,7 +53,9 @@ def streets(folder: Path) -> list[RecordingSource]:
             if text.startswith("broken"):
                 raise RecordingError(file, f"the turn is {text!r}; a number was expected")
             vehicles = FOUR[:2] if text == "empty" else FOUR
-            return recording(curve(800.0, 0.0 if text == "empty" else float(text)), vehicles, name=file.stem)
+            turn, _, change = text.partition(" ")
+            found = recording(curve(800.0, 0.0 if text == "empty" else float(turn)), vehicles, name=file.stem)
+            return CHANGES[change](found) if change else found
 
         return RecordingSource(file.stem, file.stem.partition("-")[0], (file,), read)
 
@@ -171,6 +186,24 @@ def test_a_folder_of_broken_recordings_is_an_error_with_the_first_reason(folder)
         file.write_text("broken")
     with pytest.raises(RecordingError, match=r"no recording can be read; the first one: .*a-0\.road: the turn is"):
         data(folder).generate(workers=1, progress=False)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("mapless", "the recording has no map: set data.map=false, or give it one"),
+        ("unchecked", r"velocity \[nan, nan\] of track 7 in frame 0 was expected to be finite"),
+        ("uneven", "its reader fails, ValueError"),
+    ],
+)
+def test_a_recording_without_a_map_or_with_impossible_tracks_is_left_out_and_named(folder, change, said):
+    (folder / "b-4.road").write_text(f"0.4 {change}")
+    with pytest.raises(RecordingError, match=rf"b-4.*: {said}"):
+        data(folder).generate(workers=1, progress=False, strict=True)
+    made = data(folder)
+    made.generate(workers=1, progress=False)
+    (problem,) = made.report()["skipped"].values()
+    assert re.search(said, problem)
 
 
 def test_every_recording_has_a_row_whose_windows_add_up(folder):
