@@ -146,6 +146,7 @@ def _rows(path: Path) -> pl.DataFrame:
     """The rows of one table, checked: ids and frames are unique over all cases; heading and size are NaN and 0 if absent."""
     table = read_table(path, COLUMNS, PRESENT, optional={"case_id", *SHAPE})
     table = table.with_columns(pl.lit(None, COLUMNS[name]).alias(name) for name in COLUMNS if name not in table.columns)
+    table = table.with_columns(pl.col("agent_type").str.strip_chars())
     case = np.zeros(len(table), dtype=int)
     if table["case_id"].null_count() < len(table):
         raise_first(path, table["case_id"].is_null().to_numpy(), "there is no case_id")
@@ -180,9 +181,22 @@ def _rows(path: Path) -> pl.DataFrame:
         ~np.isfinite(table["psi_rad"].fill_null(0.0).to_numpy()),
         lambda row: f"psi_rad is {table['psi_rad'][row]}; a finite number was expected",
     )
-    return table.select(
+    id, moment = (
         pl.Series("id", case * PER_CASE + track),
         pl.Series("frame", case * CASE + frame.astype(int)),
+    )
+    # Ids of records are not those in the files, so a repetition is named here.
+    raise_first(
+        path,
+        ~pl.DataFrame([id, moment]).to_struct().is_first_distinct().to_numpy(),
+        lambda row: (
+            f"track {table['track_id'][row].strip()} has frame {frame[row]:g} twice: is its id that of two agents, or a row "
+            "repeated?"
+        ),
+    )
+    return table.select(
+        id,
+        moment,
         "agent_type",
         "x",
         "y",

@@ -152,6 +152,28 @@ def test_invalid_tables_are_refused(tmp_path, change, message):
         read(folder)
 
 
+def test_a_repeated_row_is_named_by_its_file_row_and_id(tmp_path):
+    folder = write_recording(tmp_path / "whole")
+    path = next(folder.rglob("pedestrian_tracks_000.csv"))
+    path.write_text(path.read_text() + path.read_text().splitlines()[2] + "\n")
+    with pytest.raises(RecordingError, match=r"pedestrian_tracks_000.csv, row 18: track P2 has frame 1 twice"):
+        read(folder)
+    folder = write_cases(tmp_path / "cases")
+    path = next(folder.rglob("*_train.csv"))
+    path.write_text(path.read_text() + path.read_text().splitlines()[1] + "\n")
+    with pytest.raises(RecordingError, match=r"_train.csv, row 122: track 1 has frame 1 twice"):
+        read(folder)
+
+
+def test_spaces_after_commas_do_not_matter(tmp_path):
+    expected = read(write_cases(tmp_path)).tracks
+    path = next(tmp_path.rglob("*_train.csv"))
+    path.write_text(path.read_text().replace(",", ", "))
+    found = read(tmp_path).tracks
+    np.testing.assert_array_equal(found.position, expected.position)
+    np.testing.assert_array_equal(found.kind, expected.kind)
+
+
 def test_headings_in_degrees_are_refused(tmp_path):
     folder = write_cases(tmp_path)
     path = next(folder.rglob("*_train.csv"))
