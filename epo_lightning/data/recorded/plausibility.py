@@ -27,6 +27,8 @@ MISREAD: Mapping[str, Callable[[Float[np.ndarray, " S"]], Float[np.ndarray, " S"
     "clockwise": np.negative,
 }
 """Other readings of headings, by their names."""
+VEHICLES = [KINDS.index(kind) for kind in ("car", "van", "truck", "bus")]
+"""Kinds that are longer than wide."""
 AWAY, STILL = 5.0, 0.1
 """Way [m] from which on an agent has moved, and the share of it below which its velocities say that it stands."""
 JUMP = 3.0
@@ -54,7 +56,7 @@ def doubts(tracks: TrackTable) -> list[str]:
         kind = tracks.kind[tracks.agent[1:][same]]
         for index in np.unique(kind) if (kind != kind[:1]).any() else ():
             of_all += _contradictions(steps.of(kind == index), f"agents of the kind {KINDS[index]}", RATIO_OF_KIND)
-    return [*found, *of_all, *_standing(tracks), *([] if of_all else _jumps(tracks, same, steps))]
+    return [*found, *of_all, *_standing(tracks), *_broad(tracks), *([] if of_all else _jumps(tracks, same, steps))]
 
 
 class _Steps(NamedTuple):
@@ -125,6 +127,15 @@ def _standing(tracks: TrackTable) -> list[str]:
         f"{slow.sum()} of {far.sum()} agents that move {AWAY:g} m or more have velocities near zero: are the velocities "
         "missing, or in another unit than m/s?"
     ]
+
+
+def _broad(tracks: TrackTable) -> list[str]:
+    """A sentence on vehicles that are wider than long."""
+    length, width = tracks.size[np.isin(tracks.kind, VEHICLES)].T
+    broad = int((width > length).sum())
+    if 2 * broad <= len(length):
+        return []
+    return [f"{broad} of {len(length)} vehicles are wider than long: are lengths and widths exchanged?"]
 
 
 def _jumps(tracks: TrackTable, same: Bool[np.ndarray, " n"], steps: _Steps) -> list[str]:

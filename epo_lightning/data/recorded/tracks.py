@@ -63,12 +63,13 @@ class TrackTable:
         """Speed along the heading [m/s], negative when reversing."""
         return self.velocity[:, 0] * np.cos(self.heading) + self.velocity[:, 1] * np.sin(self.heading)
 
-    def check(self, path: Path | str, fastest: float = FASTEST) -> TrackTable:
+    def check(self, path: Path | str, fastest: float = FASTEST, sizes: Path | str | None = None) -> TrackTable:
         """This table, after a check that its numbers are plausible.
 
         Args:
             path: path of the file, for error messages.
             fastest: speed [m/s] that no agent exceeds from one of its rows to the next.
+            sizes: path of the file with the sizes; None if it is the same.
 
         Raises:
             RecordingError: no rows, numbers of another type or that are not finite, implausible units, or an agent whose
@@ -135,7 +136,7 @@ class TrackTable:
         if bad.any():
             agent = first(bad)
             raise RecordingError(
-                path,
+                path if sizes is None else sizes,
                 f"length and width {self.size[agent].tolist()} of track {self.ids[agent]} were expected to be positive "
                 f"and at most {LONGEST:g} m: are they in another unit?",
             )

@@ -164,6 +164,13 @@ def test_velocities_of_zero_are_doubted_if_agents_move() -> None:
     assert re.search(r"agents that move 5 m or more have velocities near zero: are the velocities missing", doubt)
 
 
+def test_vehicles_that_are_wider_than_long_are_doubted() -> None:
+    cars = dataclasses.replace(driving(), size=np.tile([4.5, 1.8], (AGENTS, 1)))
+    assert not doubts(cars)
+    (doubt,) = doubts(dataclasses.replace(cars, size=cars.size[:, ::-1]))
+    assert doubt == "6 of 6 vehicles are wider than long: are lengths and widths exchanged?"
+
+
 def test_a_jump_that_a_car_could_do_is_doubted() -> None:
     position = walking().position.copy()
     position[45:80] += 8.0

@@ -307,7 +307,7 @@ def _tracks(dialect: Dialect, setting: _Setting, files: _Files, dropped: Counter
         ids=ids,
         size=size,
         kind=kind,
-    ).check(files.tracks)
+    ).check(files.tracks, sizes=files.tracks_meta)
     _check_frames(tracks, meta, files, dropped)
     return tracks
 

@@ -150,6 +150,11 @@ def test_urban_recordings_without_a_map_have_no_lanes(tmp_path):
         ("tracks", ("8,22", "7,22"), None),
         ("tracksMeta", ("Car,1", "Car,3"), r"01_tracksMeta.csv: drivingDirection of vehicle 3 is 3; 1 \(towards"),
         ("tracksMeta", ("Car,2", "Car,1"), "drivingDirection of vehicle 8 is 1; it drives the other way"),
+        (
+            "tracksMeta",
+            ("3,4.6,1.9", "3,4.6,-1.9"),
+            r"01_tracksMeta.csv: length and width \[4.6, -1.9\] of track 3 were",
+        ),
         ("tracksMeta", ("numFrames", "frames"), "there is no column numFrames; is it 'frames'"),
         (
             "recordingMeta",
