@@ -20,6 +20,8 @@ from epo_lightning.report.runs import EvaluatedRun
 
 CONDITIONS = ("data", "trainer", "callbacks")
 """Sections of the configuration that must be equal for the learned rows of a table; the others are compared by it."""
+BATCH = "data.batch_size"
+"""The only setting of these sections in which rows may differ: it belongs to the optimisation, and changes no data."""
 
 SIDES = ("executed/missed", "alternative/missed")
 """Scores of RPI: shares of the scenes in which no mode is near the future on one side."""
@@ -151,6 +153,24 @@ def of_different_code(rows: Sequence[Row]) -> list[str]:
     return notes
 
 
+def of_different_batches(rows: Sequence[Row]) -> list[str]:
+    """Notes on the data sets whose rows were trained with different batch sizes, which labels do not always show."""
+    notes = []
+    for data in dict.fromkeys(row.runs[0].data for row in rows):
+        sizes: dict[str, list[str]] = {}
+        for row in rows:
+            if row.runs[0].data == data and row.runs[0].learned:
+                sizes.setdefault(value_text(_setting(row.runs[0].config, BATCH)), []).append(row.name)
+        if len(sizes) > 1:
+            ordered = sorted(sizes.items(), key=lambda entry: (len(entry[0]), entry[0]))  # of numbers
+            groups = "; ".join(f"{size}: {', '.join(dict.fromkeys(names))}" for size, names in ordered)
+            notes.append(
+                f"Rows on {data} were trained with different batch sizes ({groups}): after equally many epochs, those with "
+                "larger batches have taken fewer steps; after equally many steps, they have seen more scenes."
+            )
+    return notes
+
+
 def untaught(rows: Sequence[Row]) -> list[str]:
     """A note on rows with runs that may have an untaught mode, if there are any."""
     named = [
@@ -195,8 +215,8 @@ def group_of(run: EvaluatedRun) -> tuple[str, str]:
 def require_comparable(runs: Sequence[EvaluatedRun]) -> None:
     """Check that one table may compare the runs: equal data, budget, checkpoint and conditions of training.
 
-    Backbone, forecaster, dynamics, energy, solver, backward, objective, optimizer, goal and seed may differ: these are what
-    tables compare. Commits may differ too, and are shown.
+    Backbone, forecaster, dynamics, energy, solver, backward, objective, optimizer, batch size, goal and seed may differ:
+    these are what tables compare. Commits may differ too, and are shown.
 
     Raises:
         ConfigError: the message names the rows, and the key and values in which they differ.
@@ -207,7 +227,7 @@ def require_comparable(runs: Sequence[EvaluatedRun]) -> None:
     require_same(learned, "budget", lambda run: run.budget)
     require_same(learned, "checkpoint", lambda run: run.checkpoint)
     found = {key for run in learned for key, _, _ in differences(learned[0].config, run.config)}
-    for key in sorted(key for key in found if key.split(".")[0] in CONDITIONS):
+    for key in sorted(key for key in found if key.split(".")[0] in CONDITIONS and key != BATCH):
         require_same(learned, key, lambda run, key=key: value_text(_setting(run.config, key)))  # type: ignore[misc]
 
 

@@ -9,11 +9,11 @@ from typing import Any
 
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.labels import natural, word
-from epo_lightning.report.rows import Row, plain_rows, require_comparable
+from epo_lightning.report.rows import BATCH, Row, plain_rows, require_comparable
 from epo_lightning.report.runs import EvaluatedRun
 
 SEARCHED = ("optimizer", "backbone", "forecaster")
-"""Sections whose settings are searched for the best value; settings of other sections are varied for comparison."""
+"""Sections whose settings are searched for the best value, like :data:`BATCH`; others are varied for comparison."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ def best_settings(runs: Iterable[EvaluatedRun], split: str = "val", metric: str 
 
 
 def _is_searched(key: str) -> bool:
-    return key.split(".")[0] in SEARCHED and key != "forecaster.modes"
+    return (key.split(".")[0] in SEARCHED and key != "forecaster.modes") or key == BATCH
 
 
 def _best(runs: list[EvaluatedRun], rows: list[Row], metric: str) -> BestSetting:

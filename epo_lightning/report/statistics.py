@@ -1,7 +1,7 @@
 """Paired comparisons of two rows over the seeds that both have, or over the folds of a cross-validation.
 
-With the same seed, two rows see the same batches in the same order, so differences within pairs vary less than scores
-between seeds. The test is Student's two-sided paired t-test.
+With the same seed and batch size, two rows see the same batches in the same order, so differences within pairs vary less
+than scores between seeds. The test is Student's two-sided paired t-test.
 """
 
 from __future__ import annotations

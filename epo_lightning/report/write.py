@@ -31,7 +31,7 @@ from epo_lightning.report.render import (
     to_rich,
     without_html,
 )
-from epo_lightning.report.rows import of_different_code, untaught
+from epo_lightning.report.rows import of_different_batches, of_different_code, untaught
 from epo_lightning.report.runs import EvaluatedRun, collect, find_runs, read_parts, scored, scored_elsewhere
 from epo_lightning.report.selection import BestSetting, best_settings
 from epo_lightning.report.statistics import build_comparisons
@@ -136,7 +136,8 @@ def write_report(
     best, hint = _best(report.evaluated)
     settings = [settings_sheet(best)] if best else []
     rows = distinct(tables)
-    notes = [*of_different_code(rows), *untaught(rows), *notes, *damaged, *([hint] if hint else [])]
+    notes = [*of_different_code(rows), *of_different_batches(rows), *untaught(rows), *notes, *damaged]
+    notes += [hint] if hint else []
     made, charts = how_made(tables, timings), charts_of(tables, timings)
     costs = cost_sheets(tables, timings)
     elsewhere = transfers(report.runs)

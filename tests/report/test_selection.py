@@ -111,6 +111,16 @@ def test_overrides_without_an_experiment_name_the_parts(tmp_path: Path) -> None:
     assert found.words == "data=rpi backbone=v_lstm forecaster=epo optimizer.lr=0.1 solver.steps=2"
 
 
+def test_a_batch_size_can_be_searched(tmp_path: Path) -> None:
+    for size, value in ((16, 0.2), (32, 0.3)):
+        settings = {"data.batch_size": size}
+        make_run(
+            tmp_path / str(size), "V-LSTM", "marginal", scores(value), split="val", experiment="rpi/v_lstm", settings=settings
+        )
+    (found,) = best(tmp_path)
+    assert found.words == "experiment=rpi/v_lstm data.batch_size=16"
+
+
 @pytest.mark.parametrize("key", ["solver.steps", "forecaster.modes"])
 def test_settings_varied_for_comparison_are_not_selected(tmp_path: Path, key: str) -> None:
     for value in (1, 2):

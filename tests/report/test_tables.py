@@ -22,7 +22,7 @@ from epo_lightning.registry import ConfigError
 from epo_lightning.report import Report, write_report
 from epo_lightning.report.paper import papers_name
 from epo_lightning.report.render import legend
-from epo_lightning.report.rows import Cell, Row, of_different_code, untaught
+from epo_lightning.report.rows import Cell, Row, of_different_batches, of_different_code, untaught
 from epo_lightning.report.runs import collect, data_name, find_runs
 from epo_lightning.report.statistics import build_comparisons
 from epo_lightning.report.tables import build_tables, distinct, over_folds
@@ -245,7 +245,7 @@ def test_splits_are_tables_apart(tmp_path: Path) -> None:
         ({"digest": "xyz"}, r"data_digest \(evaluated on\) \(abc: V-LSTM; xyz: V-LSTM \+ EPO\)"),
         ({"trained_digest": "xyz"}, r"data_digest \(trained on\) \(abc: V-LSTM; xyz: V-LSTM \+ EPO\)"),
         ({"budget": "paper"}, r"budget \(paper: V-LSTM \+ EPO; reduced: V-LSTM\)"),
-        ({"settings": {"data.batch_size": 64}}, r"data\.batch_size \(32: V-LSTM; 64: V-LSTM \+ EPO\)"),
+        ({"settings": {"data.share": 0.5}}, r"data\.share \(0\.5: V-LSTM \+ EPO; null: V-LSTM\)"),
         ({"settings": {"trainer.max_epochs": 20}}, r"trainer\.max_epochs \(10: V-LSTM; 20: V-LSTM \+ EPO\)"),
         ({"settings": {"trainer.max_steps": 9}}, r"trainer\.max_steps \(9: V-LSTM \+ EPO; null: V-LSTM\)"),
         ({"settings": {"trainer.precision": "bf16"}}, r"trainer\.precision \(32-true: V-LSTM; bf16: V-LSTM \+ EPO\)"),
@@ -273,6 +273,18 @@ def test_parts_that_tables_compare_may_differ(tmp_path: Path) -> None:
         "V-LSTM": (3, ["0123456789abcdef"]),
         "VIBES + EPO": (1, ["fedcba9876543210"]),
     }
+
+
+def test_batch_sizes_are_compared_and_noted(tmp_path: Path) -> None:
+    for size in (32, 128):
+        make_run(tmp_path / f"a{size}", "V-LSTM", "marginal", scores(0.3), settings={"data.batch_size": size})
+    make_run(tmp_path / "b", "V-LSTM + EPO", "epo", scores(0.1))
+    make_run(tmp_path / "c", "CV", "constant_velocity", scores(0.4), settings={"data.batch_size": 8})
+    rows = rows_of(tmp_path)
+    assert {*rows} == {"V-LSTM, batch_size=32", "V-LSTM, batch_size=128", "V-LSTM + EPO", "CV"}
+    (note,) = of_different_batches([*rows.values()])
+    assert "different batch sizes (32: V-LSTM, batch_size=32, V-LSTM + EPO; 128: V-LSTM, batch_size=128): after" in note
+    assert of_different_batches([rows["V-LSTM, batch_size=32"], rows["V-LSTM + EPO"], rows["CV"]]) == []
 
 
 def test_scores_of_different_checkpoints_are_not_compared(tmp_path: Path) -> None:
