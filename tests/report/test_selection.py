@@ -114,11 +114,9 @@ def test_overrides_without_an_experiment_name_the_parts(tmp_path: Path) -> None:
 def test_a_batch_size_can_be_searched(tmp_path: Path) -> None:
     for size, value in ((16, 0.2), (32, 0.3)):
         settings = {"data.batch_size": size}
-        make_run(
-            tmp_path / str(size), "V-LSTM", "marginal", scores(value), split="val", experiment="rpi/v_lstm", settings=settings
-        )
+        make_run(tmp_path / str(size), "V-LSTM", "marginal", scores(value), split="val", settings=settings)
     (found,) = best(tmp_path)
-    assert found.words == "experiment=rpi/v_lstm data.batch_size=16"
+    assert found.words == "data=rpi backbone=v_lstm forecaster=marginal data.batch_size=16"
 
 
 @pytest.mark.parametrize("key", ["solver.steps", "forecaster.modes"])

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from epo_lightning.experiment.config.messages import one_sentence, refuse_merged, sentence
-from epo_lightning.experiment.config.replaced import keys_of_sweep, refuse_replaced, replaced
+from epo_lightning.experiment.config.replaced import SECTIONS, keys_of_sweep, refuse_replaced, replaced
 from epo_lightning.experiment.config.sources import GROUP, file_of, options_of, recorded_name
 from epo_lightning.identity import canonical, essence, of_row
 from epo_lightning.registry import ConfigError, parts
@@ -97,7 +97,7 @@ def resolve(config: DictConfig) -> dict[str, Any]:
 
     Raises:
         ConfigError: an interpolation of a key that does not exist, a value that is still missing, settings of a part that
-            the forecaster does not take, or a setting of the experiment's file that the budget replaces.
+            the forecaster does not take, or a setting of a file that the budget replaces.
     """
     from hydra.core.global_hydra import GlobalHydra
 
@@ -119,6 +119,7 @@ def resolve(config: DictConfig) -> dict[str, Any]:
         if written is not None and choices.get("experiment"):
             values["title"] = _true_title(values, written)
         # A budget for trials is small whatever else is written.
+        words += tuple(f"{group}={choices[group]}" for group in SECTIONS if choices.get(group))
         if "hydra" in config and choices.get("budget") != "smoke" and (found := replaced(words, search_path)):
             of_sweep = keys_of_sweep(choices.get(GROUP))
             refuse_replaced(values, [*config.hydra.overrides.task, *of_sweep], found)
