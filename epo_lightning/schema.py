@@ -36,8 +36,17 @@ def _read(hint: Any, value: Any, where: str) -> Any:
         if dataclasses.is_dataclass(option) and isinstance(value, Mapping):
             return read(typing.cast(type[Any], option), value, where)
     if not fits(value, hint):
-        raise ConfigError(f"{where} must be {describe(hint)}, not {value!r}")
+        raise _unfit(where, value, hint)
     return value
+
+
+def _unfit(key: str, value: Any, hint: Any) -> ConfigError:
+    """The error for a value of another type; a list of values that would fit is meant as a run of each."""
+    message = f"{key} must be {describe(hint)}, not {value!r}"
+    if isinstance(value, list) and value and all(fits(entry, hint) for entry in value):
+        each = ",".join(map(str, value))
+        message += f": for a run of each, write {each} without brackets, in a sweep or with the option -m"
+    return ConfigError(message)
 
 
 def fits(value: Any, hint: Any) -> bool:
@@ -103,7 +112,7 @@ def check_part(group: str, values: Any, supplied: Sequence[str] = ()) -> None:
         return
     for key, value in values.items():
         if key in hints and not fits(value, hints[key]):
-            raise ConfigError(f"{group}.{key} must be {describe(hints[key])}, not {value!r}")
+            raise _unfit(f"{group}.{key}", value, hints[key])
 
 
 def hints_of(part: Callable[..., Any]) -> dict[str, Any]:

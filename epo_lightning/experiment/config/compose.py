@@ -153,7 +153,7 @@ def _refuse_ignored(values: Mapping[str, Any], overrides: Iterable[str]) -> None
         there = f"write {'' if known in section else '+'}{place}={value}"
     else:
         there = "leave it out"
-    how = " as conf/experiment/rpi/*_squared.yaml do" if part == "objective" else f" for those that take a {part}"
+    how = " as conf/experiment/rpi/*_squared.yaml do" if part == "objective" else " for those that take one"
     raise ConfigError(
         f"{given[0].group()} has no effect on forecaster={name}, which takes no {part}: {there}; in a sweep over several "
         f"forecasters, write it into experiment files{how}"
@@ -208,7 +208,11 @@ def _plain_values(config: DictConfig) -> dict[str, Any]:
 
 
 def jobs(name: str, overrides: Sequence[str], extra: Sequence[str] = ()) -> list[list[str]]:
-    """The overrides of every job that Hydra's basic sweeper would launch; empty for sweepers that search (Optuna)."""
+    """The overrides of every job that Hydra's basic sweeper would launch; empty for sweepers that search (Optuna).
+
+    Raises:
+        ConfigError: as :func:`compose`, or the file of a sweep has no runs.
+    """
     from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from omegaconf import OmegaConf
@@ -222,6 +226,12 @@ def jobs(name: str, overrides: Sequence[str], extra: Sequence[str] = ()) -> list
         # Not resolved here: run_dir=one-${seed} must be resolved in each job, with the job's own seed.
         task = OmegaConf.to_container(config.hydra.overrides.task, resolve=False)
         assert isinstance(task, list)
+        sweep = config.hydra.runtime.choices.get(GROUP)
+        if sweep and not params and not any(word.startswith("experiment=") for word in task):
+            raise ConfigError(
+                f"{file_of(instance, GROUP, sweep)} has no runs: hydra.sweeper.params lists nothing, and the command "
+                "chooses no experiment. List what the runs are, for example `experiment: rpi/v_lstm_epo` and `seed: 0,1`"
+            )
         arguments = [*params, *task]
         parsed = OverridesParser.create(config_loader=instance.config_loader).parse_overrides(arguments)
         batches = BasicSweeper.split_arguments(parsed, None)
