@@ -23,6 +23,8 @@ HIGHWAYS = ("exid", "us101", "highway_sim", "highd", "ind", "round", "unid", "in
 EXPERIMENTS = "experiment"
 GLOBAL = (EXPERIMENTS, GROUP, "budget", "task", "debug")
 """Groups whose files set keys of the whole configuration, not those of a section that is named after the group."""
+PLACES = ("out", "results", "resume", "run", "run_dir", "runs", "save", "sweep")
+"""Keys whose values are paths. A folder of such a name, as where ``--config-dir`` is the working folder, is no group."""
 
 _PARSED: dict[tuple[str, str, str, int], bytes] = {}
 """Parsed files, pickled, by provider, folder, name and time of the last change."""
@@ -89,7 +91,7 @@ class TreeSource(ParsedOnce):
         return super().is_config(config_path) or self._row_on_highways(config_path) is not None
 
     def is_group(self, config_path: str) -> bool:
-        return super().is_group(config_path) or self._is_highway(config_path)
+        return config_path not in PLACES and (super().is_group(config_path) or self._is_highway(config_path))
 
     def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
         if not super().is_group(config_path) and self._is_highway(config_path):
