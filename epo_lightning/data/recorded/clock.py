@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from epo_lightning.data.recorded.tracks import TrackTable
+from epo_lightning.data.recorded.tracks import TrackTable, unwrapped
 from epo_lightning.registry import ConfigError
 
 TOO_SHORT = "in a track shorter than a window"
@@ -110,7 +110,7 @@ def stretches(
 
     kept = np.repeat(begin - np.append(0, length.cumsum()[:-1]), length) + np.arange(length.sum())
     within = length.cumsum() - length
-    heading = _unwrap(tracks.heading[kept], within)
+    heading = unwrapped(tracks.heading[kept], within)
     values = np.column_stack([tracks.position[kept], heading, tracks.velocity[kept]])
     raw = values
     if window:
@@ -136,16 +136,6 @@ def _states(values: Float[np.ndarray, "*n 5"]) -> Float[np.ndarray, "*n 4"]:
     """States [.., 4] from positions, headings and velocities [.., 5]; the speed is the component along the heading."""
     x, y, heading, right, up = np.moveaxis(values, -1, 0)
     return np.stack([x, y, heading, right * np.cos(heading) + up * np.sin(heading)], -1)
-
-
-def _unwrap(heading: Float[np.ndarray, " n"], begin: Int[np.ndarray, " C"]) -> Float[np.ndarray, " n"]:
-    """Headings without jumps of 2 pi within a stretch."""
-    turn = np.diff(heading, prepend=heading[:1])
-    turns = np.round(turn / (2 * np.pi))
-    turns[begin] = 0.0
-    total = turns.cumsum()
-    offset = np.repeat(total[begin], np.diff(np.append(begin, len(heading))))
-    return heading - 2 * np.pi * (total - offset)
 
 
 def _smooth(

@@ -177,3 +177,14 @@ class RecordingSource:
     group: str
     files: tuple[Path, ...]
     read: Callable[[], Recording]
+
+
+def unwrapped(heading: Float[np.ndarray, " n"], begin: Int[np.ndarray, " C"]) -> Float[np.ndarray, " n"]:
+    """Headings [rad] without jumps of a turn within the stretches that begin at the rows ``begin``.
+
+    The first heading of each stretch is kept.
+    """
+    turns = -np.round(np.diff(heading, prepend=heading[:1]) / (2 * np.pi))
+    turns[begin] = 0.0
+    turns = turns.cumsum()
+    return heading + 2 * np.pi * (turns - np.repeat(turns[begin], np.diff(np.append(begin, len(heading)))))

@@ -20,10 +20,10 @@ import numpy as np
 import polars as pl
 
 from epo_lightning.data.errors import RecordingError
-from epo_lightning.data.recorded.formats.motion import check_motion, direction_of_motion, unwrapped
+from epo_lightning.data.recorded.formats.motion import check_motion, direction_of_motion
 from epo_lightning.data.recorded.formats.tables import FLOAT, INT, TEXT, Types, raise_first, read_table
 from epo_lightning.data.recorded.kinds import typical_sizes
-from epo_lightning.data.recorded.tracks import Recording, RecordingSource, TrackTable
+from epo_lightning.data.recorded.tracks import Recording, RecordingSource, TrackTable, unwrapped
 from epo_lightning.registry import ConfigError, register
 from epo_lightning.scene import KINDS
 
@@ -137,7 +137,7 @@ def _tracks(path: Path, label: str, rate: float) -> TrackTable:
         agent=agent,
         frame=frame[order],
         position=position,
-        heading=unwrapped(heading, agent),
+        heading=unwrapped(heading, np.flatnonzero(np.diff(agent, prepend=-1))),
         velocity=velocity,
         ids=ids,
         size=size,

@@ -23,10 +23,10 @@ import polars as pl
 
 from epo_lightning.data.errors import RecordingError
 from epo_lightning.data.recorded.formats import lanelet2
-from epo_lightning.data.recorded.formats.motion import check_motion, direction_of_motion, unwrapped
+from epo_lightning.data.recorded.formats.motion import check_motion, direction_of_motion
 from epo_lightning.data.recorded.formats.tables import FLOAT, TEXT, Types, raise_first, read_table
 from epo_lightning.data.recorded.kinds import completed_sizes, kinds_of
-from epo_lightning.data.recorded.tracks import Recording, RecordingSource, TrackTable
+from epo_lightning.data.recorded.tracks import Recording, RecordingSource, TrackTable, unwrapped
 from epo_lightning.registry import register
 
 RATE = 10.0
@@ -129,7 +129,7 @@ def _read_recording(name: str, place: str, files: _Files) -> Recording:
         agent=agent,
         frame=rows["frame"].to_numpy(),
         position=rows.select("x", "y").to_numpy(),
-        heading=unwrapped(heading, agent),
+        heading=unwrapped(heading, np.flatnonzero(np.diff(agent, prepend=-1))),
         velocity=velocity,
         ids=ids,
         size=size,

@@ -34,11 +34,11 @@ from epo_lightning.data.recorded.formats.exid_tables import (
 )
 from epo_lightning.data.recorded.formats.highd_lanes import highd_lanes
 from epo_lightning.data.recorded.formats.levelx_dialects import DIALECTS, LANELET2, MARKINGS, Dialect
-from epo_lightning.data.recorded.formats.motion import check_motion, unwrapped
+from epo_lightning.data.recorded.formats.motion import check_motion
 from epo_lightning.data.recorded.formats.tables import FLOATS, INT, Types, raise_first
 from epo_lightning.data.recorded.kinds import completed_sizes, kinds_of
 from epo_lightning.data.recorded.lanes import LaneGraph
-from epo_lightning.data.recorded.tracks import FASTEST, Recording, RecordingSource, TrackTable
+from epo_lightning.data.recorded.tracks import FASTEST, Recording, RecordingSource, TrackTable, unwrapped
 from epo_lightning.registry import register
 
 MARKING_COLUMNS = ("upperLaneMarkings", "lowerLaneMarkings")
@@ -302,7 +302,7 @@ def _tracks(dialect: Dialect, setting: _Setting, files: _Files, dropped: Counter
         agent=agent,
         frame=rows["frame"].to_numpy(),
         position=position,
-        heading=unwrapped(heading, agent),
+        heading=unwrapped(heading, np.flatnonzero(np.diff(agent, prepend=-1))),
         velocity=velocity,
         ids=ids,
         size=size,

@@ -11,16 +11,6 @@ from epo_lightning.data.errors import RecordingError
 from epo_lightning.data.recorded.tracks import TrackTable
 
 
-def unwrapped(heading: Float[np.ndarray, " T"], agent: Int[np.ndarray, " T"]) -> Float[np.ndarray, " T"]:
-    """Headings [rad] without jumps of a turn within a track; the first heading of each track is kept."""
-    step = np.diff(heading, prepend=heading[:1])
-    turns = -np.round(step / (2 * np.pi))
-    first = np.flatnonzero(np.diff(agent, prepend=-1))
-    turns[first] = 0.0
-    turns = turns.cumsum()
-    return heading + 2 * np.pi * (turns - np.repeat(turns[first], np.diff(np.append(first, len(agent)))))
-
-
 def direction_of_motion(
     agent: Int[np.ndarray, " T"], velocity: Float[np.ndarray, "T 2"], slowest: float = 0.0
 ) -> Float[np.ndarray, " T"]:
