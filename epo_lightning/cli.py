@@ -315,7 +315,7 @@ def _sweep(arguments: Arguments) -> None:
             print(fill(says, 120, initial_indent=f"  {option:<{width}}", subsequent_indent=" " * (width + 2)))
         return
     if name not in known:
-        raise ConfigError(f"unknown sweep {name!r}: {nearest(name, known)}")
+        raise ConfigError(sweeping.unknown(name, known))
     if action == "generate":
         sweeping.generate(name, words, arguments.extra)
         return

@@ -48,7 +48,7 @@ def hydra(extra: Sequence[str] = ()) -> Iterator[Hydra]:
     """Hydra with this project's tree on its search path, and ``extra`` folders before it.
 
     Raises:
-        ConfigError: one of the ``extra`` folders does not exist.
+        ConfigError: one of the ``extra`` folders does not exist, or has no group.
     """
     from hydra import version
     from hydra._internal.hydra import Hydra
@@ -69,6 +69,12 @@ def hydra(extra: Sequence[str] = ()) -> Iterator[Hydra]:
     for folder in reversed(extra):
         if not Path(folder).is_dir():
             raise ConfigError(f"--config-dir {folder}: the folder does not exist")
+        groups = [entry.name for entry in (root / "conf").iterdir()] + [GROUP]
+        if not any((Path(folder) / group).exists() for group in groups):
+            raise ConfigError(
+                f"--config-dir {folder} has no configurations: expected a folder that contains groups, such as {GROUP}/, "
+                "experiment/ or data/"
+            )
         address = f"tree://{Path(folder).resolve()}"
         path.prepend("command-line", address, SearchPathQuery(provider="main"))
     GlobalHydra.instance().clear()

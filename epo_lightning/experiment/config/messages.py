@@ -115,7 +115,9 @@ def _missing_option(instance: Hydra, missing: str, message: str) -> str:
             f"{missing.removesuffix('.yaml')} is a plugin that is not installed: pip install 'epo_lightning[{package}]'"
         )
     group, _, option = missing.removesuffix(".yaml").partition("/")
-    options = options_of(instance, group) if option else []
+    options = options_of(instance, group)
+    if options and not option:
+        return f"{group}= chooses nothing: {_known('', options)}"
     if not options:
         return f"unknown configuration {missing!r}: " + " ".join(message.split())
     if option in parts(group):

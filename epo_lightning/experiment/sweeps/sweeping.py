@@ -7,7 +7,7 @@ import os
 import shlex
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from epo_lightning.experiment import assembly
 from epo_lightning.experiment import train as training
 from epo_lightning.experiment.config import compose
 from epo_lightning.experiment.config.settings import Settings, TrainerSettings
-from epo_lightning.experiment.config.sources import options_of
+from epo_lightning.experiment.config.sources import GROUP, options_of
 from epo_lightning.experiment.provenance import of_other_code
 from epo_lightning.experiment.sweeps.sweep import Job, State, Sweep
 from epo_lightning.experiment.sweeps.watch import news, note_former, status, summary
@@ -74,7 +74,7 @@ def run(
         states = [sweep.state(job) for job in jobs]
         sweep.begin(
             name,
-            shlex.join(mask(["epo", "sweep", name, *overrides])),
+            _command(["epo", "sweep", name, *overrides], extra),
             overrides,
             jobs,
             stop_on_failure,
@@ -336,6 +336,15 @@ def known(extra: Sequence[str] = ()) -> dict[str, str]:
             lines = next((file.read_text(encoding="utf-8").splitlines() for file in files if file.is_file()), [])
             says[option] = _description([line for line in lines if line.startswith("#") and "@package" not in line])
     return says
+
+
+def unknown(name: str, names: Collection[str]) -> str:
+    """The error message for a sweep that is not among the known ones: the nearest name, or the folder that has its file."""
+    option = Path(name).stem
+    for home in (Path(name).parent.parent, Path("conf")):
+        if option not in names and (file := home / GROUP / f"{option}.yaml").is_file():
+            return f"unknown sweep {name!r}: {file} is found by `{_command(['epo', 'sweep', option], [str(home)])}`"
+    return f"unknown sweep {name!r}: {nearest(option, names)}"
 
 
 def _description(comments: Sequence[str]) -> str:
