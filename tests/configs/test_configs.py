@@ -24,6 +24,7 @@ from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.experiment.config.sources import options_of
 from epo_lightning.forecasters import build_forecaster
 from epo_lightning.identity import identity, row_identity
+from epo_lightning.run_folder import read_json
 from epo_lightning.schema import read
 from epo_lightning.task import Task
 
@@ -264,3 +265,24 @@ def test_a_file_of_the_tree_is_read_again_when_it_has_changed(tmp_path: Path) ->
         for seed in (1, 2):
             config = compose("train", ["experiment=mine", f"seed={seed}"], [str(tmp_path / "conf")])
             assert (config["title"], config["seed"]) == (title, seed)
+
+
+def test_defaults_of_parts_may_be_replaced_by_every_budget() -> None:
+    for budget in names(CONF / "budget"):
+        compose("train", [f"budget={budget}"])
+
+
+def test_the_working_folder_can_have_the_configurations(epo: Epo, tmp_path: Path) -> None:  # noqa: F811
+    file = tmp_path / "sweeps" / "mine.yaml"
+    file.parent.mkdir()
+    file.write_text("# @package _global_\nhydra: {sweeper: {params: {experiment: rpi/const_vel}}}\n")
+    data = ("data=drawn", "data.like=rpi", "data.scenes=16")
+    words = ("sweep", "mine", "--config-dir=.", *data, "budget=smoke", "score=test")
+    assert epo(*words) == 0
+    assert (tmp_path / "runs").is_dir()
+    assert epo(*words, "runs=runs") == 0
+    (record,) = (tmp_path / "runs" / "sweeps").glob("mine-*/sweep.json")
+    assert read_json(record)["command"].endswith("--config-dir=."), "the same command can be given again"
+    (tmp_path / "results").mkdir()
+    assert epo("report", "--config-dir=.", "scenes=false", "runs=runs", "save=results/mine.json") == 0
+    assert epo("report", "--config-dir=.", "results=results/mine.json") == 0

@@ -52,6 +52,9 @@ MISTAKES = {
     "train seed=-1": "seed",
     "train trainer.max_epochs=null": "would never end",
     "train -m sweeps=rpi_mein": "'rpi_main'",
+    "train experiment=": "experiment= chooses nothing: known: argoverse2/..., dut/...",
+    "train seed=[0,1]": "for a run of each, write 0,1 without brackets, in a sweep or with the option -m",
+    "train -m optimizer.lr=[1e-3,1e-4]": "optimizer.lr must be a number, not [0.001, 0.0001]: for a run of each, write",
     "train -m solver.steps=1,x": "solver.steps must be a whole number",
     "train --multrun": "'--multirun'",
     "train experimnt=rpi/v_lstm": "did you mean 'experiment'?",
@@ -222,6 +225,8 @@ def test_mistakes_in_files_of_the_tree_are_named(
             r"params: optimizer is a section, expected dotted keys .*: write `optimizer\.lr: 1e-3,1e-4`",
         ),
         ("energy: 0;1", r"params: cannot read `energy: 0;1`"),
+        ("seed: [0, 1]", r"seed must be a whole number, not \[0, 1\]: for a run of each, write 0,1 without brackets"),
+        ("", r"has no runs: hydra\.sweeper\.params lists nothing, and the command chooses no experiment"),
     ],
 )
 def test_mistakes_in_the_values_of_a_sweep_are_named(
@@ -234,7 +239,15 @@ def test_mistakes_in_the_values_of_a_sweep_are_named(
     file.parent.mkdir(parents=True)
     file.write_text(f"# @package _global_\nhydra:\n  sweeper:\n    params:\n      {params}\n")
     said = refused("sweep", "mine", f"--config-dir={tmp_path / 'conf'}", "data=tiny", "budget=smoke")
-    assert re.search(rf"/sweeps/mine\.yaml, hydra\.sweeper\.{message}", said)
+    assert re.search(message, said)
+    assert said.startswith(("epo: seed must", f"epo: {file}"))
+
+
+def test_a_sweep_without_values_takes_those_of_the_command(tmp_path: Path) -> None:
+    (tmp_path / "sweeps").mkdir()
+    (tmp_path / "sweeps" / "mine.yaml").write_text("# @package _global_\nscore: test\n")
+    listed = jobs("train", ["sweeps=mine", "experiment=rpi/v_lstm,rpi/v_lstm_sc"], [str(tmp_path)])
+    assert [job[-1] for job in listed] == ["experiment=rpi/v_lstm", "experiment=rpi/v_lstm_sc"]
 
 
 def test_a_list_of_options_is_no_mixture_of_them(refused: Callable[..., str]) -> None:  # noqa: F811
@@ -279,3 +292,52 @@ def test_settings_of_a_row_of_own_that_the_budget_replaces_are_refused(
     assert learning_rate("budget=smoke") == 1e-3, "a budget for trials is small whatever else is written"
     listed = jobs("train", ["sweeps=mine", "budget=short"], [str(conf)])
     assert [compose("train", job, [str(conf)])["optimizer"]["lr"] for job in listed] == [1e-3, 1e-4]
+
+
+def test_settings_of_a_part_of_own_that_the_budget_replaces_are_refused(
+    tmp_path: Path,
+    refused: Callable[..., str],  # noqa: F811
+) -> None:
+    conf = tmp_path / "conf"
+    for option, text in {
+        "optimizer/mine": "name: adam\nlr: 3.0e-4",
+        "optimizer/clipped": "defaults: [adam, _self_]\nclip: 1",
+        "data/mine": "defaults: [drawn, _self_]\nlike: rpi\nbatch_size: 8",
+        "trainer/mine": "defaults: [default, _self_]\nmax_epochs: 50",
+        "callbacks/mine": "defaults: [default, _self_]\npatience: 3",
+        "experiment/mine": "# @package _global_\ndefaults: [rpi/v_lstm, override /optimizer: mine, _self_]\ntitle: mine",
+    }.items():
+        (conf / option).parent.mkdir(parents=True, exist_ok=True)
+        (conf / f"{option}.yaml").write_text(f"{text}\n")
+
+    def checked(*words: str) -> tuple[str, ...]:
+        data = () if any(word.startswith("data=") for word in words) else ("data=drawn", "data.like=rpi")
+        row = () if "experiment=mine" in words else ("experiment=rpi/v_lstm",)
+        return ("config", "check", f"--config-dir={conf}", *row, *data, *words)
+
+    for word, lost in {
+        "optimizer=mine": "optimizer/mine.yaml sets optimizer.lr: 0.0003",
+        "experiment=mine": "optimizer/mine.yaml sets optimizer.lr: 0.0003",
+        "data=mine": "data/mine.yaml sets data.batch_size: 8",
+        "trainer=mine": "trainer/mine.yaml sets trainer.max_epochs: 50",
+        "callbacks=mine": "callbacks/mine.yaml sets callbacks.patience: 3",
+    }.items():
+        for budget in ("paper", "long"):
+            said = refused(*checked(word, f"budget={budget}"))
+            assert f"{conf}/{lost} without effect: the budget's file " in said
+            assert f"conf/budget/{budget}.yaml is read later" in said
+        compose("train", checked(word, "budget=smoke")[3:], [str(conf)])
+    for words in (("optimizer=mine", "optimizer.lr=3e-4"), ("optimizer=clipped", "budget=short")):
+        compose("train", checked(*words)[3:], [str(conf)])
+
+
+def test_a_sweep_that_is_not_found_is_looked_for(tmp_path: Path, refused: Callable[..., str]) -> None:  # noqa: F811
+    for folder, name in (("sweeps", "mine"), ("conf/sweeps", "other")):
+        (tmp_path / folder).mkdir(parents=True)
+        (tmp_path / folder / f"{name}.yaml").write_text("# @package _global_\n")
+    for word in ("mine", "sweeps/mine.yaml"):
+        assert "sweeps/mine.yaml is found by `epo sweep mine --config-dir=.`" in refused("sweep", word)
+    assert "conf/sweeps/other.yaml is found by `epo sweep other --config-dir=conf`" in refused("sweep", "other")
+    assert "did you mean 'rpi_main'?" in refused("sweep", "rpi_mein")
+    assert "did you mean 'mine'?" in refused("sweep", "sweeps/mine.yaml", "--config-dir=.")
+    assert "--config-dir sweeps has no configurations: expected" in refused("sweep", "mine", "--config-dir=sweeps")
