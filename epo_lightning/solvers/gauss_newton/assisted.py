@@ -15,10 +15,11 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -66,7 +67,7 @@ def solve(
     """
     game = _Game.of(energy, scene, parameters, step_size, damping, exact)
     controls = torch.where(scene.agent_mask[:, None, :, None, None], parameters.initial_controls, 0.0)
-    status = torch.where(game.custom.finite(scene, parameters), Status.SOLVED, Status.STOPPED)
+    status = torch.where(game.finite, Status.SOLVED, Status.STOPPED)
     iterates, initial_energy = [controls], None
     for _ in range(steps):
         call = game.call(controls, 1)
@@ -150,6 +151,17 @@ class _Game:
         names = self.custom.own, self.custom.pair, self.custom.decoded_margins
         return [of[name] for of, some in zip((own, pair, margins), names, strict=True) for name in some]
 
+    @cached_property
+    def finite(self) -> Bool[Tensor, "B M"]:
+        """Mask of the games whose inputs are finite."""
+        return self.custom.finite(self.scene, self.parameters)
+
+    @cached_property
+    def _stopping(self) -> Float[Tensor, "B M *agents"]:
+        """The damping, with NaN where inputs are not finite: it stops a game, of whose inputs the kernel knows only the
+        residuals."""
+        return torch.where(self.finite if self.damping.dim() == 2 else self.finite[..., None], self.damping, torch.nan)
+
     def call(self, controls: Float[Tensor, "B M N K 2"], steps: int) -> compiled.Call:
         """A call of the kernel that takes one step from ``controls``, or none, which evaluates them."""
         game = dataclasses.replace(self.parameters, initial_controls=controls)
@@ -159,7 +171,7 @@ class _Game:
             game,
             steps,
             self.step_size,
-            self.damping,
+            self._stopping,
             keep_iterates=False,
             exact=self.exact,
             given=self._given(controls, curved=self.exact and steps > 0),

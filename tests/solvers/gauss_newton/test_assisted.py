@@ -308,6 +308,22 @@ def test_a_bad_weight_stops_its_own_game():
     assert all(gradient.isfinite().all() for gradient in gradients(leaves).values())
 
 
+@pytest.mark.parametrize(("steps", "exact"), [(0, False), (2, False), (1, True)])
+def test_an_input_that_the_function_hides_stops_its_game(steps, exact):
+    scene = random_scene(3, 3, history=2, size=1.0)
+    energy, parameters = coupled(scene, 6, pair=("room",))
+    parameters = parameters.map(torch.clone)
+    parameters.margins["room"][1, 0] = -torch.inf  # no residual is left
+    leaves = leaves_of(parameters)
+    found = assisted.solve(energy, scene, leaves, steps, 0.3, torch.full((3, 2), 100.0), exact=exact)
+    assert found.status.tolist() == [[Status.SOLVED] * 2, [Status.STOPPED, Status.SOLVED], [Status.SOLVED] * 2]
+    assert torch.equal(found.controls[1, 0], parameters.initial_controls[1, 0])
+    if steps and not exact:
+        found.controls.sum().backward()
+        assert not any(weight.grad[1, 0].any() for weight in leaves.own_weights.values() if weight.grad is not None)
+        assert all(gradient.isfinite().all() for gradient in gradients(leaves).values())
+
+
 def test_a_tensor_that_is_changed_before_the_backward_pass_is_an_error():
     scene = random_scene(2, 2, history=2)
     energy, parameters = coupled(scene, 6)
