@@ -26,7 +26,7 @@ from epo_lightning.game.feature_derivatives import (
 from epo_lightning.game.feature_inputs import FeatureInputs
 from epo_lightning.game.features import BUILT_IN, Source
 from epo_lightning.game.game_end import until
-from epo_lightning.game.pairs import pairs
+from epo_lightning.game.pairs import pair_mask, pairs
 from epo_lightning.registry import register
 from epo_lightning.scene import Scene
 
@@ -213,7 +213,7 @@ class FeatureEnergy(FeatureInputs):
             return
         agents = scene.agent_mask.shape[1]
         first, second = pairs(agents, scene.agent_mask.device)
-        both, moved = ((self.at_pair_steps(one), self.at_pair_steps(other)) for one, other in (both, moved))
+        both, moved = ((self._of_present(scene, one), self._of_present(scene, other)) for one, other in (both, moved))
         distance, normal = separation(both[0][..., :2], both[1][..., :2])
         closing = (normal * (moved[0] - moved[1])[..., :2]).sum(-1)
         for name, pair in self.pair_features.items():
@@ -229,6 +229,15 @@ class FeatureEnergy(FeatureInputs):
             exists = self.pair_exists(scene, pair, distance.shape[-1])
             weight = self.pair_weight(scene, parameters, name)[..., None]
             yield name, weight * torch.where(exists, value, 0.0), weight * torch.where(exists, change, 0.0)
+
+    def _of_present(self, scene: Scene, values: Float[Tensor, "*batch P K X"]) -> Float[Tensor, "*batch P L X"]:
+        """Values at the steps at which pairs are evaluated, without a gradient for pairs with an absent agent.
+
+        All numbers of an absent agent are zero, where a function may have no finite derivative.
+        """
+        values = self.at_pair_steps(values)
+        present = pair_mask(scene)[:, None, :, None, None]
+        return torch.where(present, values, values.detach()) if values.requires_grad else values
 
     def own_terms(
         self,

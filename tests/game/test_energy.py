@@ -154,6 +154,22 @@ def test_absent_agents_do_not_change_the_energy():
     torch.testing.assert_close(together, alone, rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("source", [Source.STEP, Source.TRAJECTORY])
+def test_absent_agents_do_not_change_gradients_of_functions_without_a_derivative_at_zero(registry, source):
+    pair_feature("inverse", source)(lambda first, second: 1.0 / (first[..., 0] * second[..., 0]))
+    scene = random_scene(2, 2, history=2, dtype=torch.float64)
+    scene.history[..., 0].add_(9.0)
+    game = random_game(scene, own=("acc",))
+    alone = replaced(game, pair_weights={"inverse": game.pair_weights["proximity"]})
+    games = leaves_of(alone), leaves_of(widen(alone))
+    for game, where in zip(games, (scene, pad(scene)), strict=True):
+        directions = torch.ones(2, *game.initial_controls.shape, dtype=torch.float64)
+        parts = FeatureEnergy(["acc"], ["inverse"]).linearisation(where, game, game.initial_controls, directions)
+        sum(part.square().sum() for part in parts).backward()
+    alone, wide = (game.initial_controls.grad for game in games)
+    torch.testing.assert_close(wide, torch.cat((alone, torch.zeros_like(alone)), 2), rtol=1e-12, atol=1e-12)
+
+
 def test_coincident_agents_have_a_finite_energy_and_a_gradient_of_zero():
     point = torch.zeros(1, 3, 2, dtype=torch.float64, requires_grad=True)
     distance, normal = separation(point, point.detach())
