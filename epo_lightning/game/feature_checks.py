@@ -117,10 +117,14 @@ def check_features(own: Any, pair: Any) -> None:
     """Check the names of an energy's features.
 
     Raises:
-        ConfigError: see :func:`~epo_lightning.game.energy.check_names`.
+        ConfigError: see :func:`~epo_lightning.game.energy.check_names`; or a name in both lists, because residuals and
+            energies are known by their names.
     """
     for key, names in (("own", own), ("pair", pair)):
         check_names(key, names, _FEATURES[key], "feature", functools.partial(_advice, key))
+    both = set(own) & set(pair)
+    if both:
+        raise ConfigError(f"energy.own and energy.pair both have a feature called {min(both)!r}: rename one")
 
 
 def _advice(key: str, name: str) -> str:

@@ -293,7 +293,7 @@ def test_functions_of_steps_have_the_changes_of_functions_of_trajectories(regist
 
     for name, source in (("mine", Source.STEP), ("theirs", Source.TRAJECTORY)):
         own_feature(name, source)(lambda states, controls: states[..., 3] * controls[..., 1] + states[..., 2].sin())
-        pair_feature(name, source)(gap)
+        pair_feature(f"{name} too", source)(gap)
     scene = random_scene(3, 3, history=2, dtype=torch.float64)
     scene.agent_mask[1, 1] = False
     scene = replaced(scene, game_steps=torch.tensor([6, 4, 1]))
@@ -302,8 +302,10 @@ def test_functions_of_steps_have_the_changes_of_functions_of_trajectories(regist
     directions = torch.randn(count, *game.initial_controls.shape, dtype=torch.float64)
     found = []
     for name in ("mine", "theirs"):
-        game = replaced(game, own_weights={name: weight}, pair_weights={name: pair})
-        found.append(FeatureEnergy([name], [name]).linearisation(scene, game, game.initial_controls, directions))
+        game = replaced(game, own_weights={name: weight}, pair_weights={f"{name} too": pair})
+        found.append(
+            FeatureEnergy([name], [f"{name} too"]).linearisation(scene, game, game.initial_controls, directions)
+        )
     for mine, theirs in zip(*found, strict=True):
         torch.testing.assert_close(mine, theirs, rtol=1e-12, atol=1e-12)
 
@@ -317,6 +319,15 @@ def test_bad_declarations_are_refused(registry):
         own_feature("mine", Source.POSITION)
     with pytest.raises(ConfigError, match="not as SPEED"):
         pair_feature("ours", Source.SPEED)
+
+
+def test_features_of_agents_and_of_pairs_have_different_names(registry):
+    own_feature("mine", Source.SPEED)(lambda speed: speed)
+    pair_feature("mine", Source.DISTANCE)(lambda distance, reach: (reach - distance).exp())
+    with pytest.raises(
+        ConfigError, match=r"energy\.own and energy\.pair both have a feature called 'mine': rename one"
+    ):
+        FeatureEnergy(["acc", "mine"], ["mine"])
 
 
 def test_the_energy_is_an_exact_potential_of_the_agents_costs():
