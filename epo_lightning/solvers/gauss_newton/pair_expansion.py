@@ -108,7 +108,9 @@ def add_undeclared_pair(sums: Sums, edges: Edges, feature: PairFeature, name: st
         edges.spread_(sums.own_dense, *(side @ side.mT for side in jacobians))
         shared = jacobians[0] @ jacobians[1].mT
         sums.pair_dense = shared if sums.pair_dense is None else sums.pair_dense + shared
-    return ((by_first != 0) & exists).any(-1).any(0)
+    coupled = ((by_first != 0) & exists).any(-1).any(0)
+    # The Hessian couples two agents also where the residual has derivatives of second order alone.
+    return coupled | (value != 0).any(-1) if sums.exact else coupled
 
 
 def _add_pair_value(sums: Sums, edges: Edges, value: Float[Tensor, "E L"]) -> None:

@@ -57,6 +57,7 @@ def features():
     pair_feature("my circles", Source.STEP, needs="size")(PAIR_FEATURES["circles"].function)
     pair_feature("my headway", Source.STEP, needs="size", margin=True)(PAIR_FEATURES["headway"].function)
     pair_feature("soft", Source.DISTANCE)(lambda distance, reach: (reach - distance).exp())
+    pair_feature("aligned", Source.STEP)(lambda one, other: 2.0 + (one[..., HEADING] - other[..., HEADING]).cos())
 
     @pair_feature("drawn apart", Source.STEP)
     def drawn_apart(one, other):
@@ -75,7 +76,7 @@ def features():
     yield
     for name in (*TWINS.values(), *COUPLED, "whole"):
         del OWN_FEATURES[name]
-    for name in (*PAIR_TWINS.values(), *COUPLED_PAIRS, "whole pair"):
+    for name in (*PAIR_TWINS.values(), *COUPLED_PAIRS, "aligned", "whole pair"):
         del PAIR_FEATURES[name]
 
 
@@ -169,6 +170,16 @@ def test_features_that_couple_states_and_controls_equal_the_reference(
         torch.testing.assert_close(gradient / scale, exact[name] / scale, rtol=0, atol=1e-9, msg=name)
 
 
+def newton_step(energy: FeatureEnergy, scene: Scene, parameters: GameParameters, damping: float) -> torch.Tensor:
+    """The controls after a step of the length 0.7 with a dense Hessian."""
+    start = parameters.initial_controls
+    matrix = hessian(energy, scene, parameters, start) + damping * torch.eye(start[0, 0].numel(), dtype=torch.float64)
+    leaf = start.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(energy(scene, parameters, leaf).sum(), leaf)
+    step = torch.linalg.solve(matrix, slope.flatten(2)[..., None]).view_as(start)
+    return torch.where(scene.agent_mask[:, None, :, None, None], start - 0.7 * step, 0.0)
+
+
 @settings(max_examples=25)
 @given(
     agents=st.integers(1, 3),
@@ -187,12 +198,19 @@ def test_newton_steps_equal_those_of_a_dense_hessian(agents, pair, own, stride, 
     damping = torch.full((2, 2), 300.0, dtype=torch.float64)
     found = assisted.solve(energy, scene, parameters, 1, 0.7, damping, exact=True)
     assert (found.status == Status.SOLVED).all()
-    start = parameters.initial_controls
-    matrix = hessian(energy, scene, parameters, start) + 300.0 * torch.eye(start[0, 0].numel(), dtype=torch.float64)
-    leaf = start.clone().requires_grad_()
-    (slope,) = torch.autograd.grad(energy(scene, parameters, leaf).sum(), leaf)
-    step = torch.linalg.solve(matrix, slope.flatten(2)[..., None]).view_as(start)
-    expected = torch.where(scene.agent_mask[:, None, :, None, None], start - 0.7 * step, 0.0)
+    expected = newton_step(energy, scene, parameters, 300.0)
+    torch.testing.assert_close(found.controls, expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("backend", [assisted, structured])
+def test_newton_steps_couple_agents_by_second_derivatives_alone(backend):
+    scene = small_scene(2, None)
+    scene.history[..., HEADING] = 0.5
+    energy, parameters = coupled(scene, 6, pair=("aligned",))
+    parameters.initial_controls[..., TURN_RATE] = 0.0
+    damping = torch.full((2, 2), 300.0, dtype=torch.float64)
+    found = backend.solve(energy, scene, parameters, 1, 0.7, damping, exact=True)
+    expected = newton_step(energy, scene, parameters, 300.0)
     torch.testing.assert_close(found.controls, expected, rtol=0, atol=1e-9)
 
 
