@@ -162,14 +162,11 @@ class Given(NamedTuple):
 
     def describe(self, game: EpoGame) -> None:
         """Write the addresses of the tensors to the structure of a game."""
-        if self.own is not None:
-            game.given, game.given_count = self.own.data_ptr(), self.own.shape[-2]
-        if self.pair is not None:
-            game.given_pairs, game.given_pair_count = self.pair.data_ptr(), self.pair.shape[-2]
-        if self.own_curvature is not None:
-            game.given_curvature = self.own_curvature.data_ptr()
-        if self.pair_curvature is not None:
-            game.given_pair_curvature = self.pair_curvature.data_ptr()
+        game.given, game.given_pairs, game.given_curvature, game.given_pair_curvature = (
+            None if one is None else one.data_ptr() for one in self
+        )
+        game.given_count = 0 if self.own is None else self.own.shape[-2]
+        game.given_pair_count = 0 if self.pair is None else self.pair.shape[-2]
 
 
 class Call:
@@ -254,6 +251,9 @@ class Call:
         """
         arguments = (self.doubles, self.game, self.arguments, self.threads, self.tape.address)
         interface.check(interface.library().epo_solve(*arguments))
+        if self.given is not None:  # the adjoint needs the factors alone
+            Given(None, None).describe(self.game)
+            self.given = None
 
     def differentiate(
         self, controls: Tensor, iterates: Tensor | None, states: Tensor | None, adjoint: Tensor | None = None
