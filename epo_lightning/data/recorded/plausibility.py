@@ -71,8 +71,11 @@ class _Steps(NamedTuple):
         return _Steps(*(values[chosen] for values in self))
 
 
-def _contradictions(steps: _Steps, who: str, most: float) -> list[str]:
-    """Sentences on positions, velocities and headings of steps; ``most`` is the largest ratio of speeds."""
+def _contradictions(steps: _Steps, agents: str, most: float) -> list[str]:
+    """Sentences on positions, velocities and headings of steps; ``most`` is the largest ratio of speeds.
+
+    ``agents`` is the subject of the sentences, such as "agents".
+    """
     steps = steps.of(_length(steps.stated) > MOVING)
     if len(steps.moved) < FEWEST:
         return []
@@ -81,23 +84,23 @@ def _contradictions(steps: _Steps, who: str, most: float) -> list[str]:
     enough = len(clear.moved) >= FEWEST
     if enough and (angle := _angle(clear.moved, clear.stated)) > ANGLE:
         return [
-            f"{who} move in another direction than that of their velocities, by {angle:.0f} degrees in the median: have "
+            f"{agents} move in another direction than that of their velocities, by {angle:.0f} degrees in the median: have "
             "positions and velocities the same axes, x and y?"
         ]
     # Along the velocity: noise of positions makes displacements longer, but not in this direction.
     ratio = float(np.median((steps.moved * steps.stated).sum(-1) / (steps.stated**2).sum(-1)))
     if not 1 / most <= ratio <= most:
         found.append(
-            f"{who} move {ratio:.2g} times as fast in their positions as their velocities say, in the median: are both in "
-            "m and m/s, and is the frame rate right?"
+            f"{agents} move {ratio:.2g} times as fast in their positions as their velocities say, in the median: are both "
+            "in m and m/s, and is the frame rate right?"
         )
     if not enough:
         return found
     angle = _angle(clear.moved, _ahead(clear.heading))
     if angle > ANGLE:
         found.append(
-            f"{who} move in another direction than that of their headings, by {angle:.0f} degrees in the median: headings "
-            "are in rad, counter-clockwise from x"
+            f"{agents} move in another direction than that of their headings, by {angle:.0f} degrees in the median: "
+            "headings are in rad, counter-clockwise from x"
         )
     elif angle > SMALL:
         # On a straight road along x, headings in a wrong unit or sense are near the right ones.
@@ -105,7 +108,7 @@ def _contradictions(steps: _Steps, who: str, most: float) -> list[str]:
         name = min(others, key=lambda each: others[each])
         if others[name] < BETTER * angle:
             found.append(
-                f"headings of {who} fit the directions of motion better if they are taken as {name}: by "
+                f"headings of {agents} fit the directions of motion better if they are taken as {name}: by "
                 f"{others[name]:.2g} instead of {angle:.2g} degrees in the median; are unit and sense right?"
             )
     return found
