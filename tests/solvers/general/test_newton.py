@@ -93,7 +93,8 @@ def test_one_minimiser_for_every_order_whatever_the_start(minimise, direction, a
     )
     energy = convex_energy(direction=direction, within=50.0)
     controls = minimise(energy, scene, game).controls.unflatten(1, (len(signs), starts))[0]
-    assert (controls - controls[:, :1]).abs().max() < 1e-6
+    # L-BFGS ends at gradients of 1e-8, and games are so flat in some directions that controls then differ by up to 1e-6.
+    assert (controls - controls[:, :1]).abs().max() < 5e-6
     # An order that is not kept at the start pushes: different orders have different minimisers.
     different = (controls[:, None, 0] - controls[None, :, 0]).abs().flatten(2).amax(-1)
     assert (different + torch.eye(len(signs)) > 1e-5).all()
