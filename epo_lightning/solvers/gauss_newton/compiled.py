@@ -156,7 +156,7 @@ class Given(NamedTuple):
     own_curvature: Float[Tensor, "B M N K 21"] | None = None
     pair_curvature: Float[Tensor, "B M P L 36"] | None = None
 
-    def held(self, dtype: torch.dtype) -> Given:
+    def of_type(self, dtype: torch.dtype) -> Given:
         """The same numbers as the kernel reads them: contiguous tensors of a type."""
         return Given(*(None if one is None else as_type(dtype, one).contiguous() for one in self))
 
@@ -204,7 +204,7 @@ class Call:
         self.arrays = GameArrays(energy, scene, parameters, controls)
         self.game, self.inputs, self.kept = self.arrays.game, self.arrays.inputs, self.arrays.kept
         self.record = torch.is_grad_enabled() and any(x.requires_grad for x in (controls, *self.inputs, *beside))
-        self.given = None if given is None else given.held(controls.dtype)
+        self.given = None if given is None else given.of_type(controls.dtype)
         if self.given is not None:
             self.given.describe(self.game)
         self.tape = _Tape()
