@@ -269,7 +269,7 @@ def test_a_file_of_the_tree_is_read_again_when_it_has_changed(tmp_path: Path) ->
 
 def test_defaults_of_parts_may_be_replaced_by_every_budget() -> None:
     for budget in names(CONF / "budget"):
-        compose("train", [f"budget={budget}"])
+        assert compose("train", [f"budget={budget}"])["budget"]["name"] == budget
 
 
 def test_the_working_folder_can_have_the_configurations(epo: Epo, tmp_path: Path) -> None:  # noqa: F811
