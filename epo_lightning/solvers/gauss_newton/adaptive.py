@@ -13,8 +13,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from epo_lightning.forecast import Solution, Status
+from epo_lightning.forecast import GameParameters, Solution, Status
+from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.host import readable
+from epo_lightning.scene import Scene
 from epo_lightning.solvers.gauss_newton.structured import LEAST_DAMPING, MOST_DAMPING
 from epo_lightning.solvers.general.descent import wide
 
@@ -25,6 +27,31 @@ _ROUNDING = 500.0
 
 Step = Callable[[Tensor | slice, Tensor, Tensor], Solution]
 """(scenes of the batch, their controls, damping [B, M] or [B, M, N]) -> solution after one step."""
+
+
+def descend_by_calls(
+    solve: Callable[..., Solution],
+    energy: FeatureEnergy,
+    scene: Scene,
+    parameters: GameParameters,
+    steps: int,
+    step_size: float,
+    damping: Float[Tensor, "B M *agents"],
+    exact: bool = False,
+    keep_iterates: bool = False,
+) -> tuple[Solution, Float[Tensor, "B M *agents"]]:
+    """At most S steps of a game by calls of ``solve``, a backend's function, each for one step of the scenes that are left.
+
+    Returns:
+        the solution and the damping to continue with.
+    """
+
+    def step(rows: Tensor | slice, controls: Tensor, damping: Tensor) -> Solution:
+        game = dataclasses.replace(parameters[rows], initial_controls=controls)
+        return solve(energy.of_scenes(rows), scene[rows], game, 1, step_size, damping, exact=exact)
+
+    here = solve(energy, scene, parameters, 0, step_size, damping)
+    return descend(step, here, steps, damping, keep_iterates)
 
 
 def descend(

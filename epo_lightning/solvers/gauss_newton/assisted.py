@@ -14,6 +14,7 @@ derivative of a minimum (:mod:`.implicit`) is the same with the Hessian and d = 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
@@ -29,7 +30,7 @@ from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import Source
 from epo_lightning.game.pairs import pairs
 from epo_lightning.scene import Scene
-from epo_lightning.solvers.gauss_newton import compiled
+from epo_lightning.solvers.gauss_newton import adaptive, compiled
 from epo_lightning.solvers.gauss_newton.structured import pullback_undeclared
 
 _SOURCES = (Source.CONTROL, Source.SPEED, Source.STEP, Source.DISTANCE)
@@ -38,6 +39,11 @@ _SOURCES = (Source.CONTROL, Source.SPEED, Source.STEP, Source.DISTANCE)
 
 def obstacle(energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> str | None:
     """Reason why the kernel cannot solve a game with the help of PyTorch; None where it can."""
+    return compiled.elsewhere(parameters) or unsupported(energy, scene, parameters)
+
+
+def unsupported(energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> str | None:
+    """The same for a game whose tensors are on the CPU, or are copied there."""
     custom, known = energy.custom, energy.built_in
     if custom is None or known is None:
         return "the compiled layer needs a built-in feature beside those of the user, such as acc with a small weight"
@@ -47,7 +53,7 @@ def obstacle(energy: FeatureEnergy, scene: Scene, parameters: GameParameters) ->
                 f"the compiled layer does not know the feature {name!r}; it takes functions of single steps that are "
                 "declared as such (Source.STEP, docs/extend.md)"
             )
-    return compiled.obstacle(known, scene, parameters)
+    return compiled.unsupported(known, scene, parameters)
 
 
 def solve(
@@ -59,13 +65,14 @@ def solve(
     damping: Float[Tensor, "B M *agents"],
     keep_iterates: bool = False,
     exact: bool = False,
+    threads: int | None = None,
 ) -> Solution:
-    """S damped steps; arguments and solution are those of :func:`.structured.solve`.
+    """S damped steps; arguments and solution are those of :func:`.compiled.solve`.
 
     Raises:
         ValueError: weights that are not those of B scenes and M modes.
     """
-    game = _Game.of(energy, scene, parameters, step_size, damping, exact)
+    game = _Game.of(energy, scene, parameters, step_size, damping, exact, threads)
     controls = torch.where(scene.agent_mask[:, None, :, None, None], parameters.initial_controls, 0.0)
     status = torch.where(game.finite, Status.SOLVED, Status.STOPPED)
     iterates, initial_energy = [controls], None
@@ -93,8 +100,29 @@ def solve(
     )
 
 
+@torch.no_grad()
+def descend(
+    energy: FeatureEnergy,
+    scene: Scene,
+    parameters: GameParameters,
+    steps: int,
+    step_size: float,
+    damping: Float[Tensor, "B M *agents"],
+    exact: bool = False,
+    threads: int | None = None,
+) -> tuple[Solution, Float[Tensor, "B M *agents"]]:
+    """S adaptive steps without a derivative, as :func:`.compiled.descend` takes them, by a call of the kernel for each."""
+    calls = functools.partial(solve, threads=threads)
+    return adaptive.descend_by_calls(calls, energy, scene, parameters, steps, step_size, damping, exact)
+
+
 def attach(
-    energy: FeatureEnergy, scene: Scene, parameters: GameParameters, controls: Float[Tensor, "B M N K 2"], exact: bool
+    energy: FeatureEnergy,
+    scene: Scene,
+    parameters: GameParameters,
+    controls: Float[Tensor, "B M N K 2"],
+    exact: bool,
+    threads: int | None = None,
 ) -> tuple[Float[Tensor, "B M N K 2"], Int[Tensor, "B M"]]:
     """The controls of a solution with their implicit derivative, and a status; see :func:`.implicit.attach`.
 
@@ -102,7 +130,7 @@ def attach(
     """
     start, none = controls.double(), controls.new_zeros(controls.shape[:2], dtype=torch.float64)
     parameters = dataclasses.replace(parameters.to(torch.float64), initial_controls=start)
-    game = _Game.of(energy, scene.to(torch.float64), parameters, 1.0, none, exact)
+    game = _Game.of(energy, scene.to(torch.float64), parameters, 1.0, none, exact, threads)
     call = game.call(start, 1)
     found, status = _Minimum.apply(game, call, start, *game.weights, *call.inputs)
     return found.to(controls.dtype), status
@@ -119,6 +147,7 @@ class _Game:
     step_size: float
     damping: Tensor
     exact: bool
+    threads: int | None
 
     @classmethod
     def of(
@@ -129,6 +158,7 @@ class _Game:
         step_size: float,
         damping: Tensor,
         exact: bool,
+        threads: int | None,
     ) -> _Game:
         """The parts of a game.
 
@@ -137,7 +167,7 @@ class _Game:
         """
         assert energy.custom is not None
         assert energy.built_in is not None
-        game = cls(energy.custom, energy.built_in, scene, parameters, step_size, damping, exact)
+        game = cls(energy.custom, energy.built_in, scene, parameters, step_size, damping, exact, threads)
         shape = parameters.initial_controls.shape
         wrong = [list(weight.shape) for weight in game.weights if weight.shape[:2] != shape[:2]]
         if wrong:
@@ -174,6 +204,7 @@ class _Game:
             self._stopping,
             keep_iterates=False,
             exact=self.exact,
+            threads=self.threads,
             given=self._given(controls, curved=self.exact and steps > 0),
             beside=self.weights,
         )

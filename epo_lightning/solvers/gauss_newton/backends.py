@@ -47,18 +47,8 @@ class Backend(Protocol):
 
 
 @runtime_checkable
-class DifferentiatingBackend(Backend, Protocol):
-    """A module whose kernel also differentiates minima."""
-
-    def attach(
-        self, energy: FeatureEnergy, scene: Scene, parameters: GameParameters, controls: Tensor, exact: bool
-    ) -> tuple[Tensor, Tensor]:
-        """The controls of a solution with their implicit derivative, and a status."""
-
-
-@runtime_checkable
-class DescendingBackend(Backend, Protocol):
-    """A module whose kernel also takes all adaptive steps in one call."""
+class KernelBackend(Backend, Protocol):
+    """A module whose kernel also takes adaptive steps and differentiates minima."""
 
     def descend(
         self,
@@ -72,14 +62,14 @@ class DescendingBackend(Backend, Protocol):
     ) -> tuple[Solution, Tensor]:
         """S adaptive steps without a derivative; returns the solution and the damping to continue with."""
 
+    def attach(
+        self, energy: FeatureEnergy, scene: Scene, parameters: GameParameters, controls: Tensor, exact: bool
+    ) -> tuple[Tensor, Tensor]:
+        """The controls of a solution with their implicit derivative, and a status."""
 
-def descending(backend: Backend) -> DescendingBackend | None:
-    """The backend, if its kernel takes all adaptive steps in one call."""
-    return next((one for one in (compiled, hosted) if one is backend), None)
 
-
-def differentiating(backend: Backend) -> DifferentiatingBackend | None:
-    """The backend, if its kernel differentiates minima."""
+def with_kernel(backend: Backend) -> KernelBackend | None:
+    """The backend, if its kernel takes adaptive steps and differentiates minima."""
     return next((one for one in (compiled, hosted, assisted) if one is backend), None)
 
 
@@ -95,7 +85,8 @@ def choose(
     Args:
         name: the setting ``backend``. ``auto`` is ``compiled`` for tensors on a CPU. For those on a GPU it is ``warp`` if
             that can solve the game and the steps are ``fixed``, and else ``host``: adaptive steps of many games end at
-            different times, of which only the host makes use. Where neither can solve the game, it is ``pytorch``.
+            different times, of which only the host makes use. Where neither can solve the game, it is ``pytorch``, and
+            also for ``fixed`` steps on a GPU with features of the user, which a CUDA graph can contain then.
         energy, scene, parameters: the game.
         fixed: whether all steps are Gauss-Newton steps with the same damping.
 
@@ -104,18 +95,15 @@ def choose(
     """
     if name == "pytorch":
         return structured
-    on_cpu = parameters.initial_controls.device.type == "cpu"
-    automatic = compiled if on_cpu else hosted
-    if not on_cpu and fixed and fused.obstacle(energy, scene, parameters) is None:
+    layer = hosted.cpu_layer(energy)
+    automatic = layer if parameters.initial_controls.device.type == "cpu" else hosted
+    own_features = energy.custom is not None
+    if automatic is hosted and fixed and (own_features or fused.obstacle(energy, scene, parameters) is None):
         automatic = fused
-    chosen = {"compiled": compiled, "host": hosted, "warp": fused}.get(name, automatic)
+    chosen = {"compiled": layer, "host": hosted, "warp": fused}.get(name, automatic)
     obstacle = chosen.obstacle(energy, scene, parameters)
     if obstacle is None:
         return chosen
-    if chosen is compiled and energy.custom is not None:
-        obstacle = assisted.obstacle(energy, scene, parameters)
-        if obstacle is None:
-            return assisted
     if name != "auto":
         raise ValueError(f"solver.backend is {name!r}, but {obstacle}; 'auto' and 'pytorch' can solve this game")
     if not torch.compiler.is_exporting():

@@ -35,10 +35,13 @@ from epo_lightning.solvers.general import descent
 
 def obstacle(energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> str | None:
     """Reason why the kernel cannot solve a game; None where it can."""
+    return elsewhere(parameters) or unsupported(energy, scene, parameters)
+
+
+def elsewhere(parameters: GameParameters) -> str | None:
+    """Reason why the kernel cannot read the tensors of a game; None where they are on the CPU."""
     device = parameters.initial_controls.device
-    if device.type != "cpu":
-        return f"the compiled layer runs on CPUs, and these tensors are on {device}"
-    return unsupported(energy, scene, parameters)
+    return None if device.type == "cpu" else f"the compiled layer runs on CPUs, and these tensors are on {device}"
 
 
 def unsupported(energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> str | None:

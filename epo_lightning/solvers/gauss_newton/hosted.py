@@ -1,5 +1,7 @@
 """The host backend for tensors on a GPU: the game is copied to the CPU, solved there by the compiled layer, and copied back.
 
+Features of the user are evaluated on the CPU as well (:mod:`.assisted`).
+
 A batch's parameters and controls are some 100 kB. Everything that the kernel reads is packed into one buffer on the device,
 which one copy brings into pinned memory; the solution goes back the same way. The backward pass makes one copy of the
 cotangents and one of the gradients. The copies have a stream of their own. The host waits for the first copy of each pass,
@@ -13,6 +15,7 @@ from __future__ import annotations
 import functools
 import os
 from collections.abc import Sequence
+from types import ModuleType
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -23,7 +26,7 @@ from torch.autograd.function import once_differentiable
 from epo_lightning.forecast import GameParameters, Solution
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import Scene
-from epo_lightning.solvers.gauss_newton import compiled
+from epo_lightning.solvers.gauss_newton import assisted, compiled
 
 
 @runtime_checkable
@@ -97,7 +100,12 @@ def obstacle(energy: FeatureEnergy, scene: Scene, parameters: GameParameters) ->
         return f"the game is copied from CUDA devices, and these tensors are on {device}"
     if device.type == "cuda" and torch.cuda.is_current_stream_capturing():
         return "the host solves the game, and a CUDA graph cannot contain work of the host"
-    return compiled.unsupported(energy, scene, parameters)
+    return cpu_layer(energy).unsupported(energy, scene, parameters)
+
+
+def cpu_layer(energy: FeatureEnergy) -> ModuleType:
+    """The module that solves games of an energy on the CPU."""
+    return compiled if energy.custom is None else assisted
 
 
 def solve(
@@ -113,7 +121,9 @@ def solve(
     """S damped Gauss-Newton steps of :func:`.compiled.solve` for tensors on a device; differentiable by the same inputs."""
     transfer = _Transfer(parameters)
     here, game, factor = transfer.to_host(_read(energy, scene), _given(energy, parameters), damping)
-    found = compiled.solve(energy, here, game, steps, step_size, factor, keep_iterates, exact, threads=_cores())
+    found = cpu_layer(energy).solve(
+        energy, here, game, steps, step_size, factor, keep_iterates, exact, threads=_cores()
+    )
     return transfer.to_device(found)[0]
 
 
@@ -129,7 +139,7 @@ def descend(
     """S adaptive steps of :func:`.compiled.descend` for tensors on a device; the solution, and the damping afterwards."""
     transfer = _Transfer(parameters)
     here, game, factor = transfer.to_host(_read(energy, scene), _given(energy, parameters), damping)
-    found, last = compiled.descend(energy, here, game, steps, step_size, factor, exact, threads=_cores())
+    found, last = cpu_layer(energy).descend(energy, here, game, steps, step_size, factor, exact, threads=_cores())
     solution, damping = transfer.to_device(found, last)
     return solution, damping
 
@@ -140,7 +150,7 @@ def attach(
     """The controls of a solution with their implicit derivative, and a status, as :func:`.compiled.attach` returns them."""
     transfer = _Transfer(parameters)
     here, game, copy = transfer.to_host(_read(energy, scene), _given(energy, parameters), controls)
-    found, status = transfer.to_device(*compiled.attach(energy, here, game, copy, exact, threads=_cores()))
+    found, status = transfer.to_device(*cpu_layer(energy).attach(energy, here, game, copy, exact, threads=_cores()))
     return found, status
 
 

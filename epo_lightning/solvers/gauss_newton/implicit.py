@@ -45,7 +45,7 @@ def attach(
         controls are no minimum; such a problem has a gradient of zero.
     """
     chosen = backends.choose(backend, energy, scene, dataclasses.replace(parameters, initial_controls=controls))
-    kernel = backends.differentiating(chosen)
+    kernel = backends.with_kernel(chosen)
     if kernel is not None:
         return kernel.attach(energy, scene, parameters, controls, exact)
     none = controls.new_zeros(controls.shape[:2]).flatten()

@@ -178,13 +178,9 @@ class LevenbergMarquardt(Stepwise):
         backend, size = backends.choose(self.backend, energy, scene, parameters, fixed), self.step_size
         if not self.adaptive:
             return backend.solve(energy, scene, parameters, steps, size, damping, self.keep_iterates, exact), damping
-        kernel = backends.descending(backend)
+        kernel = backends.with_kernel(backend)
         if kernel is not None and not torch.is_grad_enabled() and not self.keep_iterates:
             return kernel.descend(energy, scene, parameters, steps, size, damping, exact)
-
-        def step(rows: Tensor | slice, controls: Tensor, damping: Tensor) -> Solution:
-            game = dataclasses.replace(parameters[rows], initial_controls=controls)
-            return backend.solve(energy.of_scenes(rows), scene[rows], game, 1, size, damping, False, exact)
-
-        here = backend.solve(energy, scene, parameters, 0, size, damping)
-        return adaptive.descend(step, here, steps, damping, self.keep_iterates)
+        return adaptive.descend_by_calls(
+            backend.solve, energy, scene, parameters, steps, size, damping, exact, self.keep_iterates
+        )

@@ -14,8 +14,10 @@ from torch.utils._pytree import tree_map
 from epo_lightning.forecast import Status
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.game.features import OWN_FEATURES, PAIR_FEATURES, Source, own_feature, pair_feature
+from epo_lightning.scene import SPEED, TURN_RATE
 from epo_lightning.solvers.backward import Implicit
-from epo_lightning.solvers.gauss_newton import backends, compiled, hosted, structured
+from epo_lightning.solvers.gauss_newton import assisted, backends, compiled, hosted, structured
 from epo_lightning.solvers.gauss_newton.kernel import interface
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
@@ -187,6 +189,74 @@ def test_adaptive_and_implicit_solutions_are_those_of_the_compiled_layer(copies)
     found_by, by = gradients(there), gradients(theirs)
     assert any((gradient != 0).any() for gradient in by.values())
     assert all(torch.equal(values(found_by[name]), by[name]) for name in by)
+
+
+@pytest.fixture
+def own_features():
+    """An own and a pair feature of the user, and a game with them."""
+
+    @own_feature("drift", Source.STEP)
+    def drift(states, controls):
+        return states[..., SPEED] * controls[..., TURN_RATE]
+
+    @pair_feature("room", Source.STEP, needs="size", margin=True)
+    def room(one, other, size, other_size, margin):
+        away = (one[..., :2] - other[..., :2]).square().sum(-1)
+        return ((size + other_size).sum(-1) + margin - away).relu()
+
+    scene = random_scene(4, 3, history=3, size=1.5, lanes=2)
+    scene.agent_mask[1, 1] = False
+    energy = FeatureEnergy(["goal", "acc", "turnr", "lane", "drift"], ["proximity", "room"])
+    game = random_game(scene, 2, 7, pair=("proximity",), spread=0.1)
+    own = {name: game.own_weights["acc"].clone() for name in energy.own}
+    pair = {name: game.pair_weights["proximity"].clone() for name in energy.pair}
+    margins = {"room": torch.full_like(pair["room"], 0.5)}
+    yield energy, scene, dataclasses.replace(game, own_weights=own, pair_weights=pair, margins=margins)
+    del OWN_FEATURES["drift"], PAIR_FEATURES["room"]
+
+
+def test_features_of_the_user_are_evaluated_on_the_host(own_features, copies):
+    energy, scene, game = own_features
+    ours, theirs, damping = leaves_of(game), leaves_of(game), torch.full((4, 2), 5.0)
+    there = remote(ours)
+    found = hosted.solve(energy, remote(scene), there, 2, 0.3, Remote(damping), keep_iterates=True)
+    expected = assisted.solve(energy, scene, theirs, 2, 0.3, damping, keep_iterates=True)
+    assert [way for way, _ in copies.copied] == ["to host", "to device"]
+    for name in ("controls", "states", "initial_energy", "energy", "gradient_norm", "status"):
+        assert torch.equal(values(getattr(found, name)), getattr(expected, name)), name
+    (found.states.square().sum() + found.iterates[1].sum()).backward()
+    (expected.states.square().sum() + expected.iterates[1].sum()).backward()
+    exact = gradients(theirs)
+    assert all(exact[name].any() for name in ("drift", "room", "margin of room"))
+    found_by = gradients(there)
+    assert all(torch.equal(values(found_by[name]), exact[name]) for name in exact)
+
+
+def test_minima_with_features_of_the_user_are_found_and_differentiated_on_the_host(own_features, copies):
+    energy, scene, game = own_features
+    ours, theirs = leaves_of(game), leaves_of(game)
+    there = remote(ours)
+    minimise = LevenbergMarquardt(10, 1.0, 1.0, adaptive=True, newton_steps=10)
+    with Factories():
+        found = Implicit()(minimise, energy, remote(scene), there)
+        found.controls.square().sum().backward()
+    assert [way for way, _ in copies.copied] == ["to host", "to device"] * 4, "two descents, minima, gradients"
+    expected = Implicit()(minimise, energy, scene, theirs)
+    expected.controls.square().sum().backward()
+    assert torch.equal(values(found.controls), expected.controls)
+    exact, found_by = gradients(theirs), gradients(there)
+    assert exact["drift"].any()
+    assert all(torch.equal(values(found_by[name]), exact[name]) for name in exact)
+
+
+def test_fixed_steps_with_features_of_the_user_stay_on_the_device(own_features):
+    """A CUDA graph can contain them there."""
+    energy, scene, game = own_features
+    backends.say_once.cache_clear()
+    with pytest.warns(UserWarning, match="the fused layer"):
+        assert backends.choose("auto", energy, remote(scene), remote(game), fixed=True) is structured
+    assert backends.choose("auto", energy, remote(scene), remote(game)) is hosted
+    assert backends.choose("host", energy, remote(scene), remote(game), fixed=True) is hosted
 
 
 def test_the_host_backend_is_for_games_on_a_device_that_the_kernel_knows():
