@@ -7,7 +7,8 @@ gradient by the logits is softmax - one-hot even if the probability underflows.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch
@@ -16,8 +17,34 @@ from torch import Tensor
 from torch.nn import functional as F
 
 
-@dataclass(frozen=True)
-class Relaxation:
+@dataclass
+class Schedule(ABC):
+    """A number of a loss that falls during training and ends at zero.
+
+    Attributes:
+        held: a tensor that takes the place of the number until it is zero. A CUDA graph repeats the numbers of Python with
+            which it was captured, but reads the value that a tensor has at each replay.
+    """
+
+    held: Tensor | None = field(default=None, init=False, repr=False, compare=False)
+
+    @abstractmethod
+    def number(self, step: int) -> float:
+        """The number at an optimisation step."""
+
+    def at(self, step: int) -> float | Tensor:
+        """The number at an optimisation step, or the tensor that holds it."""
+        number = self.number(step)
+        return self.held if self.held is not None and number > 0 else number
+
+
+def counts(number: float | Tensor) -> bool:
+    """Whether a number of a schedule is above zero, which those in tensors are."""
+    return isinstance(number, Tensor) or number > 0
+
+
+@dataclass
+class Relaxation(Schedule):
     """Schedule of a loss that trains all modes a little at first: (1 - share) * closest mode + share * mean over modes.
 
     The paper's loss trains only the mode that is closest to the data. A mode that starts far from the data gets no gradient
@@ -37,7 +64,7 @@ class Relaxation:
                 f"relaxation must be in [0, 1] and relaxation_steps 1 or more, not {self.share} and {self.steps}"
             )
 
-    def at(self, step: int) -> float:
+    def number(self, step: int) -> float:
         """The share at an optimisation step."""
         return self.share * max(0.0, 1.0 - step / self.steps)
 
@@ -46,8 +73,8 @@ HARDEST = 0.01
 """Temperature [m] at which annealing ends and the hard minimum begins: modes 5 cm apart are told apart by then."""
 
 
-@dataclass(frozen=True)
-class Annealing:
+@dataclass
+class Annealing(Schedule):
     """Schedule of a loss with a soft minimum over modes, whose temperature falls (annealed winner-takes-all).
 
     With the distances d_m [m] of the modes from the data and the temperature T [m], the loss is
@@ -77,14 +104,14 @@ class Annealing:
                 f"{self.temperature} and {self.steps}"
             )
 
-    def at(self, step: int) -> float:
+    def number(self, step: int) -> float:
         """The temperature [m] at an optimisation step; 0 for the hard minimum."""
         if self.temperature == 0 or step >= self.steps:
             return 0.0
         return float(self.temperature * (HARDEST / self.temperature) ** (step / self.steps))
 
 
-def soft_minimum(distance: Tensor, temperature: float) -> Tensor:
+def soft_minimum(distance: Tensor, temperature: float | Tensor) -> Tensor:
     """The soft minimum over dimension 1 at a positive temperature (:class:`Annealing`).
 
     Modes at an infinite distance do not count.
@@ -93,7 +120,7 @@ def soft_minimum(distance: Tensor, temperature: float) -> Tensor:
     return -temperature * ((-_rounded(distance, temperature) / temperature).logsumexp(1) - count.log())
 
 
-def _rounded(distance: Tensor, temperature: float) -> Tensor:
+def _rounded(distance: Tensor, temperature: float | Tensor) -> Tensor:
     """h(d) = sqrt(d^2 + T^2) - T, without the cancellation for small d; infinite for an infinite d, without a gradient."""
     known = distance.isfinite()
     ratio = torch.where(known, distance, 0.0) / temperature
@@ -112,8 +139,8 @@ class Softness(NamedTuple):
     """
 
     power: float = 1.0
-    relaxation: float = 0.0
-    temperature: float = 0.0
+    relaxation: float | Tensor = 0.0
+    temperature: float | Tensor = 0.0
 
 
 @dataclass(frozen=True)
@@ -145,6 +172,17 @@ class ImitationSchedule:
     def at(self, step: int) -> Softness:
         """The loss at an optimisation step."""
         return Softness(self.power, self.relaxation.at(step), self.annealing.at(step))
+
+
+def schedules_in(owner: object) -> list[Schedule]:
+    """The schedules among the attributes of an objective or a forecaster."""
+    found: list[Schedule] = []
+    for value in vars(owner).values():
+        if isinstance(value, Schedule):
+            found.append(value)
+        elif isinstance(value, ImitationSchedule):
+            found += value.relaxation, value.annealing
+    return found
 
 
 def distances(
@@ -185,17 +223,20 @@ def _mean_over_agents(values: Tensor, mask: Bool[Tensor, "B N K"]) -> Tensor:
 
 
 def _relaxed(
-    closest: Float[Tensor, "B *agents"], distance: Float[Tensor, "B M *agents"], relaxation: float
+    closest: Float[Tensor, "B *agents"], distance: Float[Tensor, "B M *agents"], relaxation: float | Tensor
 ) -> Float[Tensor, "B *agents"]:
     """The distance of the closest mode, mixed with a share of the mean over all modes.
 
     Without relaxation, modes at an infinite distance do not count.
     """
-    return torch.lerp(closest, distance.mean(1), relaxation) if relaxation > 0 else closest
+    return torch.lerp(closest, distance.mean(1), relaxation) if counts(relaxation) else closest
 
 
 def scene_imitation(
-    distance: Float[Tensor, "B M N"], mask: Bool[Tensor, "B N K"], relaxation: float = 0.0, temperature: float = 0.0
+    distance: Float[Tensor, "B M N"],
+    mask: Bool[Tensor, "B N K"],
+    relaxation: float | Tensor = 0.0,
+    temperature: float | Tensor = 0.0,
 ) -> tuple[Float[Tensor, ""], Int[Tensor, " B"]]:
     """L_imit, the minSADE: distance of the joint future closest to the observed one, and the index of that mode.
 
@@ -207,13 +248,13 @@ def scene_imitation(
     """
     joint = _mean_over_agents(distance, mask)
     closest, mode = joint.min(1)
-    if temperature > 0:
+    if counts(temperature):
         closest = soft_minimum(joint, temperature)
     return _relaxed(closest, joint, relaxation).mean(), mode
 
 
 def mode_shares(
-    distance: Float[Tensor, "B M N"], mask: Bool[Tensor, "B N K"], temperature: float
+    distance: Float[Tensor, "B M N"], mask: Bool[Tensor, "B N K"], temperature: float | Tensor
 ) -> Float[Tensor, "B M"]:
     """Share of every mode in an annealed loss at a positive temperature (:class:`Annealing`), without a gradient."""
     return (-_rounded(_mean_over_agents(distance.detach(), mask), temperature) / temperature).softmax(1)
@@ -246,14 +287,17 @@ def goal(
 
 
 def marginal_imitation(
-    distance: Float[Tensor, "B M N"], mask: Bool[Tensor, "B N K"], relaxation: float = 0.0, temperature: float = 0.0
+    distance: Float[Tensor, "B M N"],
+    mask: Bool[Tensor, "B N K"],
+    relaxation: float | Tensor = 0.0,
+    temperature: float | Tensor = 0.0,
 ) -> tuple[Float[Tensor, ""], Int[Tensor, "B N"]]:
     """The minADE: mean over agents of the distance of their own closest futures, and the indices of these modes.
 
     Arguments as of :func:`scene_imitation`.
     """
     closest, mode = distance.min(1)
-    if temperature > 0:
+    if counts(temperature):
         closest = soft_minimum(distance, temperature)
     return _mean_over_agents(_relaxed(closest, distance, relaxation), mask).mean(), mode
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import jaxtyping
 import pytest
@@ -67,6 +68,19 @@ def test_relaxation_adds_the_mean_over_modes_and_decays():
     assert marginal.item() == 1.75
     with pytest.raises(ValueError, match="relaxation"):
         losses.Relaxation(share=2.0)
+
+
+def test_a_held_number_takes_the_place_of_the_number_until_it_is_zero():
+    schedule = losses.ImitationSchedule(1.0, losses.Relaxation(0.5, 10), losses.Annealing(2.0, 5))
+    for one in losses.schedules_in(SimpleNamespace(schedule=schedule, other=3)):
+        one.held = torch.tensor(0.25)
+    assert schedule.relaxation.at(0) is schedule.relaxation.held
+    assert schedule.relaxation.at(10) == 0.0
+    _, relaxation, temperature = schedule.at(4)
+    assert isinstance(temperature, torch.Tensor)
+    assert schedule.at(5).temperature == 0.0
+    for loss in (losses.scene_imitation, losses.marginal_imitation):
+        assert loss(DISTANCE, MASK, relaxation, temperature)[0] == loss(DISTANCE, MASK, 0.25, 0.25)[0]
 
 
 def test_the_temperature_falls_geometrically_to_a_centimetre_and_then_is_zero():

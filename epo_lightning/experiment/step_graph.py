@@ -5,13 +5,14 @@ launch. Of every batch only the values change: they are copied into the tensors 
 static losses and gradients. The optimizer, gradient clipping and logging are outside of the graph and stay as they are.
 
 A graph repeats what was launched while it was captured. Nothing in a step may therefore make the host wait, be drawn on the
-CPU, or change from step to step except by tensors on the device.
+CPU, or change from step to step except by tensors on the device. Relaxation and annealing of a loss are such tensors; the
+host writes their numbers before every step. When one of them ends, the step is captured once more without it.
 """
 
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -21,13 +22,12 @@ from torch import Tensor, nn
 
 from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.forecasters import Forecaster
+from epo_lightning.losses import Schedule
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import FIELDS, Scene
 
 WARM_UP = 3
 """Training steps before the capture: they compile kernels and make handles of libraries, which a capture cannot contain."""
-SCHEDULES = ("relaxation", "annealing")
-"""Settings of losses that change with the number of the step."""
 
 
 class Outcome(NamedTuple):
@@ -85,6 +85,7 @@ class StepGraph(Callback):
     """
 
     def __init__(self) -> None:
+        self._schedules: Sequence[Schedule] = ()
         self._end()
 
     def _end(self) -> None:
@@ -92,6 +93,10 @@ class StepGraph(Callback):
         self._steps = 0
         self._parameters: list[nn.Parameter] = []
         self._layout: tuple[Any, ...] | None = None
+        for schedule in self._schedules:
+            schedule.held = None
+        self._schedules = ()
+        self._changing: list[bool] = []
         self._replay: Callable[[Scene], Outcome] | None = None
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -111,6 +116,9 @@ class StepGraph(Callback):
         self._forecaster = forecaster
         self._parameters = [parameter for parameter in forecaster.parameters() if parameter.requires_grad]
         self._recorder = Recorder(forecaster.device)
+        self._schedules = forecaster.schedules
+        for schedule in self._schedules:
+            schedule.held = torch.zeros((), device=forecaster.device, dtype=self._parameters[0].dtype)
         forecaster.step_graph = self.step
 
     def step(self, scene: Scene) -> tuple[Tensor, dict[str, Tensor]]:
@@ -124,6 +132,7 @@ class StepGraph(Callback):
         layout = _layout(scene)
         self._layout = self._layout or layout
         self._steps += 1
+        self._write_numbers()
         if self._steps <= WARM_UP or layout != self._layout:
             outcome = self._recorder.run(lambda: self._compute(scene))
         else:
@@ -134,6 +143,17 @@ class StepGraph(Callback):
             parameter.grad = gradient
         total, *terms = outcome.losses.clone().unbind()
         return total, dict(zip(outcome.names, terms, strict=True))
+
+    def _write_numbers(self) -> None:
+        """Bring the numbers of the loss at this step to the device; forget the graph if one of them has ended."""
+        numbers = [schedule.number(self._forecaster.global_step) for schedule in self._schedules]
+        changing = [number > 0 for number in numbers]
+        if changing != self._changing:
+            self._changing, self._replay = changing, None
+        for schedule, number in zip(self._schedules, numbers, strict=True):
+            assert schedule.held is not None
+            if number > 0:
+                schedule.held.fill_(number)
 
     def _compute(self, scene: Scene) -> Outcome:
         # Without gradients to add to, the backward pass makes new tensors, which a replay overwrites.
@@ -195,13 +215,6 @@ def check(settings: Settings, forecaster: Forecaster) -> None:
             "trainer.graph=false, or use levenberg_marquardt with solver.backend=pytorch, or with solver.backend=warp "
             "(pip install 'epo_lightning[gpu]') and solver.adaptive=false"
         )
-    for section in ("forecaster", "objective"):
-        for name in SCHEDULES:
-            if value := getattr(settings, section).get(name):
-                raise ConfigError(
-                    f"trainer.graph=true with {section}.{name}={value}: a CUDA graph would repeat the loss of one step, and "
-                    f"this one changes from step to step; set {section}.{name}=0 or trainer.graph=false"
-                )
 
 
 def check_machine(settings: Settings) -> None:

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from epo_lightning import doubts
 from epo_lightning.decoders.weights import SharedWeights
 from epo_lightning.forecast import JointForecast
+from epo_lightning.losses import Schedule, schedules_in
 from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.metrics.forecast import COLUMNS, STOPPED, stopped
 from epo_lightning.objectives.base import Terms
@@ -179,6 +180,11 @@ class Forecaster(LightningModule):
         if not parameters:
             return None
         return self.optimizer.configure(parameters, self.trainer.estimated_stepping_batches, self.shared_weights)
+
+    @property
+    def schedules(self) -> list[Schedule]:
+        """The numbers of the loss that change during training."""
+        return schedules_in(self)
 
     @property
     def shared_weights(self) -> list[nn.Parameter]:

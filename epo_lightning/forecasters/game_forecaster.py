@@ -7,6 +7,7 @@ import dataclasses
 from epo_lightning.forecast import JointForecast
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.game.energy import Energy
+from epo_lightning.losses import Schedule, schedules_in
 from epo_lightning.objectives.base import Objective, Terms
 from epo_lightning.scene import Scene
 from epo_lightning.solvers.backward import Backward
@@ -50,3 +51,7 @@ class GameForecaster(Forecaster):
 
     def losses(self, scene: Scene, forecast: JointForecast) -> Terms:
         return self.objective(self.game_scene(scene), forecast, self.energy, self.global_step)
+
+    @property
+    def schedules(self) -> list[Schedule]:
+        return [*super().schedules, *schedules_in(self.objective)]
