@@ -148,16 +148,17 @@ def _serve(pipe: Connection) -> None:
 
 
 def _episode(pipe: Connection, road: _Road, branch: Branch) -> None:
-    """Simulate an episode in this process, and end the process."""
-    status = 0
+    """Simulate an episode in this process, and end the process: with status 1 if an error could not be told."""
+    status = 1
     try:
         road.hesitate = _Hesitation(STYLES[branch.style], (branch.layout, branch.seed, branch.number))
         pipe.send((road.taken, [road.history[-1].around(road.taken, each) for each in road.history]))
         while not isinstance(path := pipe.recv(), str) or path != END:
             now = road.advance(None if isinstance(path, str) else path)
             pipe.send(now.around(road.taken, now))
+        status = 0
     except (EOFError, BrokenPipeError):
-        pass
+        status = 0
     except Exception as error:  # as above
         pipe.send(error)
         status = 0

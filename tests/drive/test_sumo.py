@@ -25,7 +25,7 @@ from epo_lightning.scene import Scene
 pytest.importorskip("libsumo", reason="the extra `sim` is not installed")
 
 from epo_lightning.drive.sumo import SumoSimulation, SumoSimulator, lanes_of, sumo_world
-from epo_lightning.drive.sumo_process import END, _closed, _stream
+from epo_lightning.drive.sumo_process import END, Branch, _closed, _episode, _stream
 
 
 @pytest.fixture(scope="module")
@@ -123,6 +123,39 @@ def test_the_end_of_the_process_is_told() -> None:
         with pytest.raises(ConfigError, match="the process of SUMO ended: is there enough memory"):
             ask()
     simulation.end()  # nothing more is sent
+
+
+class Unsendable(RuntimeError):
+    """Error that no process can send to another one."""
+
+    def __reduce__(self) -> str:
+        raise TypeError("no copy of this error")
+
+
+@pytest.mark.parametrize(
+    ("error", "status"), [(Unsendable(), 1), (RuntimeError("a sign of SUMO"), 0), (EOFError(), 0)], ids=repr
+)
+def test_an_episode_ends_with_a_status_of_its_own_where_its_error_was_not_told(
+    monkeypatch: pytest.MonkeyPatch, error: Exception, status: int
+) -> None:
+    """Without one, the process that waits for an answer would wait for ever: the simulation tells it by that status."""
+
+    class BrokenRoad:
+        taken = "planned"
+
+        @property
+        def history(self) -> list[object]:
+            raise error
+
+    def end(status: int) -> None:
+        raise SystemExit(status)
+
+    monkeypatch.setattr("os._exit", end)
+    here, there = Pipe()
+    with pytest.raises(SystemExit) as ended:
+        _episode(there, BrokenRoad(), Branch(0, 0, "free", 0))  # type: ignore[arg-type]
+    assert ended.value.code == status
+    assert here.poll() == (type(error) is RuntimeError), "this error alone was sent"
 
 
 def test_a_simulation_ends_when_no_process_waits_for_it() -> None:
