@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -15,6 +14,7 @@ from lightning.pytorch import Trainer, seed_everything
 from lightning.pytorch.callbacks import TQDMProgressBar
 
 from epo_lightning import pretrained
+from epo_lightning.data.cache import file_digest
 from epo_lightning.data.rpi.scenes import RPIData
 from epo_lightning.experiment import assembly, logs
 from epo_lightning.experiment.callbacks import style_of
@@ -186,7 +186,7 @@ def keep_other(run: RunFolder, other: OtherData, which: str, checkpoint: Path, m
     The name ``scores-on-<data>-<split>-<digest>-<digest>.json`` has digests of the test and of the checkpoint. If the file
     holds the same scores it stays as it is; if it holds others, which another version computed, the name gets a number.
     """
-    digest = _digest(checkpoint)
+    digest = file_digest(checkpoint)[:16]
     stem = f"{OTHER}{other.name}-{other.split}-{other.test[:8]}-{digest[:8]}"
     scored = {
         "data": other.name,
@@ -224,7 +224,7 @@ def keep(run: RunFolder, scored: dict[str, Any], checkpoint: Path) -> Path:
             if completed != stored:
                 write_json(file, completed)
             return file
-    digest = _digest(checkpoint)
+    digest = file_digest(checkpoint)[:16]
     stem = f"scores-{scored['split']}-{Path(scored['checkpoint']).stem}-{digest[:8]}"
     return _beside(run, stem, {**scored, "checkpoint_digest": digest}, ("data_digest", "checkpoint_digest"))
 
@@ -261,10 +261,6 @@ def _beside(run: RunFolder, stem: str, scored: dict[str, Any], keys: Sequence[st
         if _same(read_json(file), scored, keys):
             return file
     raise AssertionError("unreachable")
-
-
-def _digest(checkpoint: Path) -> str:
-    return hashlib.sha256(checkpoint.read_bytes()).hexdigest()[:16]
 
 
 def _readable(file: Path) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
@@ -15,6 +14,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from epo_lightning import pretrained
+from epo_lightning.data.cache import file_digest
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.card import SCORES, Recipe, card, recipe_of, recipes
 from epo_lightning.experiment.checkpoints import WholeCheckpoints
@@ -100,8 +100,7 @@ def _pack(run: RunFolder, packed: RunFolder) -> RunFolder:
     packed.checkpoints.mkdir(exist_ok=True)
     weights = {"configuration": content["configuration"], "state_dict": shrunk(content["state_dict"])}
     WholeCheckpoints().save_checkpoint(weights, packed.checkpoint("best"))
-    digest = hashlib.sha256(packed.checkpoint("best").read_bytes()).hexdigest()
-    write_json(packed.record_file, {**run.record, "sha256": digest})
+    write_json(packed.record_file, {**run.record, "sha256": file_digest(packed.checkpoint("best"))})
     write_file(packed.path / "scenes.safetensors", save(tensors, {"dt": str(scenes.dt)}))
 
     file, _ = score(packed, EvaluateSettings(run=str(packed.path)))
