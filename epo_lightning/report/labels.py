@@ -8,7 +8,7 @@ import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-from epo_lightning.identity import differences, essence
+from epo_lightning.identity import differences, essence, leaves
 
 MOST, LONGEST, DIGITS = 4, 24, 3
 """Largest number of settings in a label, largest length of a value's text, and number of its digits."""
@@ -34,7 +34,7 @@ def varying(configs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 def short_keys(keys: Sequence[str], config: Mapping[str, Any]) -> dict[str, str]:
     """Shortest unambiguous ending of every key in the configuration: ``lr`` for ``optimizer.lr``."""
-    known = {*_keys(essence(config)), *keys}
+    known = {*(key for key, _ in leaves(essence(config))), *keys}
     return {key: next(ending for ending in _endings(key) if _is_alone(ending, known) or ending == key) for key in keys}
 
 
@@ -119,14 +119,6 @@ def _long_union(values: Sequence[Any]) -> list[str]:
     longest: list[str] = max(values, key=len)
     contained = all(set(value) <= set(longest) for value in values)
     return longest if contained and len(value_text(longest)) > LONGEST else []
-
-
-def _keys(values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
-    for key, value in values.items():
-        if isinstance(value, Mapping) and value:
-            yield from _keys(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}"
 
 
 def _endings(key: str) -> Iterator[str]:

@@ -50,6 +50,18 @@ def no_account(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("NETRC", str(tmp_path / "netrc"))
 
 
+def test_empty_sections_are_parameters_of_a_run_like_others() -> None:
+    """Without it, a dashboard would not tell a row without margins from one of a version that knows none."""
+    config = {"seed": 0, "energy": {"name": "features", "margins": {}, "bounds": {"vel": [0.0, 2.0]}}}
+    facts = Facts(id="a", name="a", group=None, config=config, tags={}, folder=Path("run"))
+    assert facts.parameters() == {
+        "seed": 0,
+        "energy.name": "features",
+        "energy.margins": {},
+        "energy.bounds.vel": [0.0, 2.0],
+    }
+
+
 @pytest.fixture
 def stopped(epo: Epo, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Train four epochs and fail at the beginning of the third."""

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
+from epo_lightning.identity import leaves
+
 Row = tuple[int, Mapping[str, float]]
 """An optimisation step and the metrics logged at it."""
 ARTIFACTS = ("config.yaml", "run.json", "checkpoints/best.ckpt")
@@ -36,14 +38,7 @@ class Facts:
 
     def parameters(self) -> dict[str, Any]:
         """The configuration with one dotted name per value."""
-        return dict(_flat(self.config))
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    found: list[tuple[str, Any]] = []
-    for key, value in values.items():
-        found += _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else [(f"{prefix}{key}", value)]
-    return found
+        return dict(leaves(self.config))
 
 
 @dataclass(frozen=True)
