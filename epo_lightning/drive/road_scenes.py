@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +15,7 @@ from epo_lightning.data.recorded.surroundings import nearest_pieces
 from epo_lightning.data.recorded.tables import SceneTables
 from epo_lightning.data.recorded.windows import SPACING, VECTORS, WindowConfig
 from epo_lightning.frames import AGREE
-from epo_lightning.scene import FIELDS, HEADING, SPEED, Scene
+from epo_lightning.scene import HEADING, SPEED, Scene
 
 
 class RoadScenes:
@@ -104,12 +102,3 @@ class RoadScenes:
         columns = {name: torch.as_tensor(values) for name, values in tables.columns().items()}
         scenes = RecordedScenes(columns, self.windows.dt, "aligned", ("",))[torch.arange(len(origin))]
         return dataclasses.replace(scenes, future=None, future_mask=None, id=None)
-
-
-def joined(scenes: Sequence[Scene]) -> Scene:
-    """One batch of scenes with the same fields and sizes."""
-    if len(scenes) == 1:
-        return scenes[0]
-    fields = {name: [getattr(scene, name) for scene in scenes] for name in FIELDS}
-    together: dict[str, Any] = {name: torch.cat(tensors) for name, tensors in fields.items() if tensors[0] is not None}
-    return dataclasses.replace(scenes[0], **together)

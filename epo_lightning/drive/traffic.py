@@ -19,7 +19,7 @@ from torch import Tensor
 from epo_lightning.data.recorded.lanes import LaneGraph
 from epo_lightning.drive.ride import WINDOWS, Ride, Simulation, contacts
 from epo_lightning.drive.road_game import ENERGY, road_game
-from epo_lightning.drive.road_scenes import RoadScenes, joined
+from epo_lightning.drive.road_scenes import RoadScenes
 from epo_lightning.drive.world import EGO, Outcome, Search
 from epo_lightning.forecast import GameParameters
 from epo_lightning.game.dynamics import Unicycle
@@ -106,7 +106,7 @@ class TrafficWorld:
             maps.setdefault(id(ride.simulation.lanes), []).append(index)
         scenes = [self._on_one_map([rides[index] for index in chosen]) for chosen in maps.values()]
         order = torch.tensor([index for chosen in maps.values() for index in chosen])
-        return joined(scenes)[order.argsort()]
+        return Scene.concatenated(scenes)[order.argsort()]
 
     def _on_one_map(self, rides: Sequence[Ride]) -> Scene:
         """Scenes of episodes on one map, which are made together."""
