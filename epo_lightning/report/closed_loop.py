@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from epo_lightning.registry import ConfigError, nearest
-from epo_lightning.report.scores import markdown
+from epo_lightning.report.render import markdown
 from epo_lightning.run_folder import read_json
 
 Estimates = Mapping[str, Mapping[str, float]]

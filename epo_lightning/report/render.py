@@ -274,10 +274,15 @@ def to_markdown(table: Table | Sheet) -> str:
             [_plain(row.name), str(len(row.runs)), *(_markdown_cell(row, column) for column in table.columns)]
             for row in table.rows
         ]
-    rule = "|" + ":--|" * left + "--:|" * (len(header) - left)
-    rows = ["| " + " | ".join(line) + " |" for line in (header, *lines)]
     note = ["", _plain(table.note)] if isinstance(table, Sheet) and table.note else []
-    return "\n".join([f"## {_plain(table.title)}", "", rows[0], rule, *rows[1:], *note]) + "\n"
+    return "\n".join([f"## {_plain(table.title)}", "", markdown(header, lines, left), *note]) + "\n"
+
+
+def markdown(header: Sequence[str], lines: Iterable[Sequence[str]], left: int = 1) -> str:
+    """A Markdown table whose cells may have links and emphasis."""
+    rule = "|" + ":--|" * left + "--:|" * (len(header) - left)
+    first, *rest = ("| " + " | ".join(line) + " |" for line in (header, *lines))
+    return "\n".join([first, rule, *rest])
 
 
 def _plain(text: str) -> str:

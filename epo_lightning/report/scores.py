@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.report.columns import EQUILIBRIUM, MAIN, PROBABILITIES, TRUTH
 from epo_lightning.report.folds import mean_scores
+from epo_lightning.report.render import markdown
 from epo_lightning.report.statistics import compare
 
 METRICS = {
@@ -161,13 +162,6 @@ def table(
         values = [*paper.get(title, ()), *[""] * known][:known]
         lines.append((title, str(row.n), *(row.text(metric) for metric in metrics), *values))
     return markdown(header, lines)
-
-
-def markdown(header: Sequence[str], lines: Iterable[Sequence[str]], left: int = 1) -> str:
-    """A Markdown table whose cells may have links and emphasis."""
-    rule = "|" + ":--|" * left + "--:|" * (len(header) - left)
-    first, *rest = ("| " + " | ".join(line) + " |" for line in (header, *lines))
-    return "\n".join([first, rule, *rest])
 
 
 def _decimal(value: float, digits: int, sign: bool = False) -> str:

@@ -30,10 +30,11 @@ from epo_lightning.report.closed_loop import ClosedLoop, read_closed_loop
 from epo_lightning.report.columns import MISSING
 from epo_lightning.report.costs import last_fifth
 from epo_lightning.report.curves import METRIC, validation_log
+from epo_lightning.report.render import markdown
 from epo_lightning.report.results import read_results
 from epo_lightning.report.rows import Row, plain_rows
 from epo_lightning.report.runs import EvaluatedRun, read_other, read_parts
-from epo_lightning.report.scores import Differences, Scores, average, below, markdown, table
+from epo_lightning.report.scores import Differences, Scores, average, below, table
 from epo_lightning.report.tables import build_tables, over_folds
 from epo_lightning.run_folder import errors_naming, write_file
 
