@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -98,8 +98,8 @@ def transfers(runs: Iterable[Records]) -> list[Line]:
         variants.setdefault((test.name, test.split, test.digest), set()).update({test.variant} - {""})
     members: dict[tuple[str, str], dict[TestSet, dict[int, EvaluatedRun]]] = {}
     for test, one in found:
-        alone = len(variants[test.name, test.split, test.digest]) < 2
-        test = TestSet(test.name, test.split, test.digest, "" if alone else test.variant, test.about)
+        if len(variants[test.name, test.split, test.digest]) < 2:
+            test = replace(test, variant="")
         checkpoint = one.checkpoint if one.learned else "best"
         # Of the scores that several versions computed, the last ones count; runs are in the order of their files.
         members.setdefault((one.row, checkpoint), {}).setdefault(test, {})[one.seed] = one
@@ -171,7 +171,7 @@ def transfer_sheets(lines: Sequence[Line]) -> list[Sheet]:
         )
         header = ("trained on", "method", "n", *tests.values())
         sheets.append(Sheet(f"Transfer: {column.label}", header, texts, 2, ends))
-    sheets[-1] = Sheet(**{**vars(sheets[-1]), "note": NOTE})
+    sheets[-1] = replace(sheets[-1], note=NOTE)
     return [*sheets, _test_sheet(tests)]
 
 
