@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -18,10 +17,9 @@ from matplotlib.ticker import MultipleLocator
 from torch import Tensor
 
 from epo_lightning.forecast import JointForecast
+from epo_lightning.report.scene_panels import Color, draw_path, mixed
 from epo_lightning.report.style import AGENTS, HISTORY, MODES, OTHER, TRUTH, save, style
 from epo_lightning.scene import Scene
-
-Color = str | tuple[float, float, float]
 
 PANEL = 3.1
 """Width and height of a panel [inch]."""
@@ -82,7 +80,7 @@ def _draw_scene(axes: Axes, scene: Scene, other: Tensor | None, agents: Sequence
     for i in _present(scene):
         history, future = _observed(scene, i)
         axes.plot(*history.T, color=HISTORY, lw=1.6, ls=(0, (1, 1)), zorder=2)
-        _fading_line(axes, np.concatenate([history[-1:], future]), HISTORY, TRUTH, width=1.2, zorder=6.0)
+        _draw_line(axes, np.concatenate([history[-1:], future]), HISTORY, TRUTH, width=1.2, zorder=6.0)
         axes.plot(*history[0], marker="o", ms=3.5, color=HISTORY, zorder=2)
         if other is not None:
             axes.plot(*other[i, :, :2].double().numpy().T, color=OTHER, lw=1.2, ls=(0, (4, 2)), zorder=5)
@@ -102,7 +100,7 @@ def _draw_modes(axes: Axes, scene: Scene, forecast: JointForecast) -> None:
         for i in _present(scene):
             start = scene.current[0, i, :2].double().numpy()
             positions = np.concatenate([start[None], forecast.states[0, m, i, :, :2].double().numpy()])
-            _fading_line(axes, positions, _tint(color, 0.25), color, width, zorder=3 + 0.2 * rank)
+            _draw_line(axes, positions, mixed("white", color, 0.25), color, width, zorder=3 + 0.2 * rank)
             if scene.size is not None:
                 radius = scene.size[0, i, 0].item() / 2
                 axes.add_patch(Circle(positions[-1], radius, fc=(*to_rgb(color), 0.12), ec=color, lw=1.1, zorder=3))
@@ -125,18 +123,9 @@ def _observed(scene: Scene, i: int) -> tuple[np.ndarray, np.ndarray]:
     return history.double().numpy(), scene.future[0, i, :, :2][scene.future_mask[0, i]].double().numpy()
 
 
-def _fading_line(axes: Axes, positions: np.ndarray, start: Color, end: Color, width: float, zorder: float) -> None:
-    """Draw a trajectory whose colour changes from ``start`` to ``end``."""
-    share = np.linspace(0, 1, max(len(positions) - 1, 1))[:, None]
-    colors = (1 - share) * np.array(to_rgb(start)) + share * np.array(to_rgb(end))
-    segments = np.stack([positions[:-1], positions[1:]], axis=1)
-    axes.add_collection(LineCollection(list(segments), colors=colors, lw=width, zorder=zorder, capstyle="round"))
-
-
-def _tint(color: str, strength: float) -> Color:
-    """A colour mixed with white."""
-    red, green, blue = (1 - strength * (1 - channel) for channel in to_rgb(color))
-    return red, green, blue
+def _draw_line(axes: Axes, positions: np.ndarray, start: Color, end: Color, width: float, zorder: float) -> None:
+    """Draw a whole trajectory whose colour changes from ``start`` to ``end``."""
+    draw_path(axes, positions, np.ones(len(positions), bool), start, end, width, zorder)
 
 
 def _name(axes: Axes, name: str, where: np.ndarray, centre: np.ndarray) -> None:
