@@ -81,7 +81,7 @@ class StepsCurve:
     paper: bool = False
 
 
-def learning_curves(rows: Iterable[Row], metric: str = METRIC) -> tuple[list[Curve], list[str]]:
+def learning_curves(rows: Iterable[Row]) -> tuple[list[Curve], list[str]]:
     """Learning curve of every row (validation score over training steps), and a note for each row without one.
 
     A row's curve ends where the first of its seeds stopped, so that its mean is always over all of them.
@@ -91,7 +91,7 @@ def learning_curves(rows: Iterable[Row], metric: str = METRIC) -> tuple[list[Cur
         if not any(run.learned for run in row.runs):
             continue
         try:
-            logs = [validation_log(run.records, metric) for run in row.runs]
+            logs = [validation_log(run.records, METRIC) for run in row.runs]
         except ConfigError as error:
             notes.append(f"{row.name} is left out: {error}")
             continue

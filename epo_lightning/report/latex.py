@@ -47,11 +47,10 @@ def _letter(letter: str) -> str:
     return letter if known or letter in "ßæøÆØ" else f"{{[}}U+{ord(letter):04X}{{]}}"
 
 
-def to_latex(table: Table, label: str | None = None, caveat: str = "") -> str:
+def to_latex(table: Table, caveat: str = "") -> str:
     """A table of rows and metrics as LaTeX, with rules between the groups of rows.
 
     Args:
-        label: name for ``\\ref``; by default derived from the title.
         caveat: plain text, printed in bold before the legend.
     """
     lines = []
@@ -66,7 +65,7 @@ def to_latex(table: Table, label: str | None = None, caveat: str = "") -> str:
     header = ["Method", "$n$", *(latex_text(column.label) for column in table.columns)]
     columns = "lr" + "r" * len(table.columns)
     caption = _caption(table.title, caveat, _legend(table))
-    return _float(behind(table.rows), header, columns, lines, caption, label or slug(table.title))
+    return _float(behind(table.rows), header, columns, lines, caption, slug(table.title))
 
 
 def _caption(title: str, caveat: str, legend: str) -> str:
@@ -80,15 +79,13 @@ def _legend(table: Table) -> str:
     return text.replace("±", r"$\pm$").replace("n seeds", "$n$ seeds")
 
 
-def sheet_to_latex(
-    sheet: Sheet, rows: Sequence[Row] = (), caption: str = "", label: str | None = None, caveat: str = ""
-) -> str:
+def sheet_to_latex(sheet: Sheet, rows: Sequence[Row] = (), caption: str = "", caveat: str = "") -> str:
     """A sheet of plain text as a LaTeX table.
 
     Args:
         rows: rows whose provenance goes into the comments.
         caption: LaTeX text after the title; by default the sheet's note.
-        label, caveat: as in :func:`to_latex`.
+        caveat: as in :func:`to_latex`.
     """
     lines = []
     for index, line in enumerate(sheet.lines):
@@ -99,13 +96,13 @@ def sheet_to_latex(
     columns = "l" * sheet.left + "r" * (len(sheet.header) - sheet.left)
     caption = _caption(sheet.title, caveat, caption or latex_text(sheet.note))
     header = [latex_text(text) for text in sheet.header]
-    return _float(behind(rows), header, columns, lines, caption, label or slug(sheet.title))
+    return _float(behind(rows), header, columns, lines, caption, slug(sheet.title))
 
 
-def comparisons_to_latex(comparisons: Comparisons, label: str | None = None, caveat: str = "") -> str:
-    """The paired comparisons of a table as LaTeX; label and caveat as in :func:`to_latex`."""
+def comparisons_to_latex(comparisons: Comparisons, caveat: str = "") -> str:
+    """The paired comparisons of a table as LaTeX; the caveat is as in :func:`to_latex`."""
     rows = {row.identity: row for pair in comparisons.pairs for row in (pair.one, pair.other)}
-    return sheet_to_latex(comparison_sheet(comparisons), list(rows.values()), COMPARISON_CAPTION, label, caveat)
+    return sheet_to_latex(comparison_sheet(comparisons), list(rows.values()), COMPARISON_CAPTION, caveat)
 
 
 def behind(rows: Sequence[Row]) -> list[str]:
@@ -122,7 +119,7 @@ def behind(rows: Sequence[Row]) -> list[str]:
 
 
 def slug(title: str) -> str:
-    """``tab:`` and the letters and digits of a title."""
+    """Name of a table for ``\\ref``: ``tab:`` and the letters and digits of its title."""
     return "tab:" + "-".join(re.findall(r"[a-z0-9]+", title.lower()))
 
 

@@ -42,11 +42,11 @@ def highway_scene(scene: Scene, forecast: JointForecast, path: str | Path, title
     return _picture(scene, futures, path, title)
 
 
-def highway_comparison(scene: Scene, forecasts: Mapping[str, JointForecast], path: str | Path, title: str = "") -> Path:
+def highway_comparison(scene: Scene, forecasts: Mapping[str, JointForecast], path: str | Path) -> Path:
     """Picture of the most likely joint mode of several forecasters, one panel each (Fig. 4). Returns its path.
 
     Args:
-        scene, path, title: as for :func:`highway_scene`.
+        scene, path: as for :func:`highway_scene`.
         forecasts: forecasts of this scene, by the name of the row in the tables.
 
     Raises:
@@ -55,7 +55,7 @@ def highway_comparison(scene: Scene, forecasts: Mapping[str, JointForecast], pat
     if not forecasts:
         raise ValueError("comparison without forecasts: nothing to draw")
     futures = [joint_mode(forecast, by_probability(forecast)[0], name) for name, forecast in forecasts.items()]
-    return _picture(scene, futures, path, title)
+    return _picture(scene, futures, path, "")
 
 
 def _picture(scene: Scene, futures: Sequence[JointMode], path: str | Path, title: str) -> Path:

@@ -53,28 +53,23 @@ class BestSetting:
         return len(self.compared)
 
 
-def best_settings(runs: Iterable[EvaluatedRun], split: str = "val", metric: str = "minSADE") -> list[BestSetting]:
-    """The setting with the lowest mean over seeds, for every experiment with several settings.
+def best_settings(runs: Iterable[EvaluatedRun], metric: str = "minSADE") -> list[BestSetting]:
+    """The setting with the lowest mean over seeds on the validation split, for every experiment with several settings.
 
     A sweep over the optimisation steps, or over the number of modes, is not a search. A setting with fewer seeds than
     another is left out: a mean over one lucky seed must not win.
 
     Args:
         runs: evaluated runs of a search; scores on other splits are ignored.
-        split: must be ``val``.
         metric: score to minimise.
 
     Raises:
-        ConfigError: ``split`` is not ``val``, a run lacks the metric, settings are not comparable, or none is complete.
+        ConfigError: no run was scored on the validation split, one lacks the metric, settings are not comparable, or none is
+            complete.
     """
-    if split != "val":
-        raise ConfigError(
-            f"settings are chosen on the validation split, not on split={split}: a setting chosen on the test split has "
-            "seen it; score the runs with `epo evaluate runs=<folder> split=val`"
-        )
     experiments: dict[tuple[str, str, str], list[EvaluatedRun]] = {}
     for run in runs:
-        if run.split == split:
+        if run.split == "val":
             experiments.setdefault((run.data, run.experiment, run.name), []).append(run)
     if not experiments:
         raise ConfigError("no run was scored on the validation split: run `epo evaluate runs=<folder> split=val`")
