@@ -55,8 +55,7 @@ def draw(
 
         rows, others = pairs(scenes, settings.figures)
         other = None if others is None else scenes.future[others]
-        forecasts = {title: forecast_of(forecaster, scenes[rows])}
-        path = joint_predictions(scenes[rows], forecasts, folder / "joint_predictions.png", other)
+        path = joint_predictions(scenes[rows], {title: forecast[rows]}, folder / "joint_predictions.png", other)
         drawn.append((path, rows.tolist()))
     if settings.animate:
         from epo_lightning.report.animation import animate
