@@ -6,6 +6,7 @@ import hashlib
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from matplotlib.figure import Figure
 
@@ -21,7 +22,7 @@ from epo_lightning.report.curves import (
 )
 from epo_lightning.report.efficiency import Efficiency, draw_efficiency, efficiencies
 from epo_lightning.report.paper import RUNTIME, RUNTIME_MODES
-from epo_lightning.report.runtime import draw_modes, heat_map
+from epo_lightning.report.runtime import OURS, THEIRS, draw_modes, heat_map
 from epo_lightning.report.tables import Table, distinct, trained_rows
 from epo_lightning.report.timings import Timing, grid, methods, over_modes, places, time
 
@@ -88,14 +89,19 @@ def _learning(tables: Sequence[Table]) -> Iterable[Chart]:
                 title=f"Learning curves, {data}",
                 caption="minSADE on the validation split while training: mean over seeds, with a band from the best "
                 "to the worst seed. A line ends where the first of its seeds stopped.",
-                draw=lambda size, legend, curves=curves: draw_learning(curves, size, legend),  # type: ignore[misc]
+                draw=partial(draw_learning, curves),
                 wide=(8.8, 4.3),
                 narrow=(4.0, 3.5),
-                legend=tuple(Key(curve.name, look(i)[0], look(i)[1] != "-") for i, curve in enumerate(curves)),
+                legend=_keys(curves),
                 header=("row", "seeds", "last step", "minSADE there", "smallest mean", "at step"),
                 numbers=tuple(_summary(curve) for curve in curves),
                 notes=tuple(notes),
             )
+
+
+def _keys(curves: Iterable[Curve]) -> tuple[Key, ...]:
+    """Legend of a chart with one line per curve."""
+    return tuple(Key(curve.name, look(i)[0], look(i)[1] != "-") for i, curve in enumerate(curves))
 
 
 def _summary(curve: Curve) -> tuple[str, ...]:
@@ -122,7 +128,7 @@ def _steps(tables: Sequence[Table]) -> Iterable[Chart]:
             caption="minSADE of what the game's solution predicts (optimised) and of what the network alone predicts "
             "(initial): mean over seeds, with a band from the best to the worst."
             + (" Dashed: the paper's figure, on its RPI validation split." if curve.paper else ""),
-            draw=lambda size, legend, curve=curve: draw_steps(curve, size, legend),  # type: ignore[misc]
+            draw=partial(draw_steps, curve),
             wide=(8.8, 4.1),
             narrow=(4.0, 3.3),
             legend=tuple(Key(*entry) for entry in steps_names(curve)),
@@ -152,10 +158,10 @@ def _efficiency(tables: Sequence[Table]) -> Iterable[Chart]:
             title=f"minSADE over the share of the training games, {entry.data}",
             caption="minSADE of rows trained on a share of the games: mean over seeds, with a band from the best "
             "to the worst.",
-            draw=lambda size, legend, entry=entry: draw_efficiency(entry.curves, size, legend),  # type: ignore[misc]
+            draw=partial(draw_efficiency, entry.curves),
             wide=(8.8, 4.3),
             narrow=(4.0, 3.5),
-            legend=tuple(Key(curve.name, look(i)[0], look(i)[1] != "-") for i, curve in enumerate(entry.curves)),
+            legend=_keys(entry.curves),
             header=("row", "share of the games", "seeds", "minSADE [m]"),
             numbers=tuple(_efficiency_numbers(entry)),
         )
@@ -200,10 +206,10 @@ def _runtimes(timings: Sequence[Timing]) -> Iterable[Chart]:
                 caption=f"Mean time of one joint forecast with N = {agents} agents"
                 + (f" and S = {steps} steps." if steps is not None else ".")
                 + (" The paper's own two panels differ where they meet (N = 4, S = 2, M = 4)." if paper else ""),
-                draw=lambda size, legend, values=by_modes, paper=paper: draw_modes(values, paper, size, legend),  # type: ignore[misc]
+                draw=partial(draw_modes, by_modes, paper),
                 wide=(8.8, 3.3),
                 narrow=(4.0, 2.9),
-                legend=(Key("here", "#0072B2"), *([Key("paper", "#8A8A8A", True)] if paper else [])),
+                legend=(Key("here", OURS), *([Key("paper", THEIRS, True)] if paper else [])),
                 header=header,
                 numbers=numbers,
             )

@@ -16,6 +16,8 @@ from epo_lightning.report.timings import time
 
 BLUES = LinearSegmentedColormap.from_list("calm", ["#EEF5FB", "#C6DBEF", "#6BAED6", "#2171B5", "#0B3F7A"])
 """Colour map from light (fast) to dark (slow), as in the paper."""
+OURS, THEIRS = MODES[1], "#8A8A8A"
+"""Colours of the lines of this project and of the paper."""
 
 
 def heat_map(
@@ -116,7 +118,7 @@ def draw_modes(
         axes.plot(
             list(seconds),
             list(seconds.values()),
-            color=MODES[1],
+            color=OURS,
             lw=1.9,
             marker="o",
             ms=5,
@@ -127,7 +129,7 @@ def draw_modes(
             axes.plot(
                 list(paper),
                 list(paper.values()),
-                color="#8A8A8A",
+                color=THEIRS,
                 lw=1.2,
                 ls=(0, (4, 3)),
                 marker="o",
