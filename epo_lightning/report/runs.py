@@ -238,12 +238,8 @@ def _evaluated(
 ) -> EvaluatedRun:
     """The scores in one file of a run folder; ``again`` says how to write it again."""
     metrics = _entry(result, file, again, "metrics")
-    if not isinstance(metrics, Mapping) or not all(isinstance(value, int | float) for value in metrics.values()):
-        raise ConfigError(f"{file}: metrics must be numbers by name; {again}")
-    truth = result.get("truth", {})
-    if not isinstance(truth, Mapping) or not all(isinstance(value, int | float) for value in truth.values()):
-        raise ConfigError(f"{file}: truth must be numbers by name; {again}")
-    of_costs = {f"{TRUE}{name}": value for name, value in truth.items()}
+    check_known(result, dict.fromkeys(("metrics", "truth"), NUMBERS_BY_NAME), str(file), again)
+    of_costs = {f"{TRUE}{name}": value for name, value in result.get("truth", {}).items()}
     if result.get("split", split) != split:
         raise ConfigError(f"{file} holds scores of the {result['split']} split, was it renamed? {again}")
     digest = str(_entry(result, file, again, "data_digest"))
