@@ -16,7 +16,7 @@ from epo_lightning.experiment import assembly
 from epo_lightning.experiment import train as training
 from epo_lightning.experiment.config import compose
 from epo_lightning.experiment.config.settings import Settings, TrainerSettings
-from epo_lightning.experiment.config.sources import GROUP, options_of
+from epo_lightning.experiment.config.sources import GROUP, file_of, options_of
 from epo_lightning.experiment.provenance import of_other_code
 from epo_lightning.experiment.sweeps.sweep import Job, State, Sweep
 from epo_lightning.experiment.sweeps.watch import news, note_former, status, summary
@@ -331,9 +331,8 @@ def known(extra: Sequence[str] = ()) -> dict[str, str]:
     """The names of all sweeps, and the description with which each file begins."""
     says = {}
     with compose.hydra(extra) as instance:
-        for option in options_of(instance, "sweeps"):
-            files = (folder / "sweeps" / f"{option}.yaml" for folder in [*map(Path, extra), compose.tree()])
-            lines = next((file.read_text(encoding="utf-8").splitlines() for file in files if file.is_file()), [])
+        for option in options_of(instance, GROUP):
+            lines = Path(file_of(instance, GROUP, option)).read_text(encoding="utf-8").splitlines()
             says[option] = _description([line for line in lines if line.startswith("#") and "@package" not in line])
     return says
 
