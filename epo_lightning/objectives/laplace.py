@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import torch
@@ -111,10 +112,7 @@ def log_densities(
     damping: float,
 ) -> tuple[Float[Tensor, "B M"], Bool[Tensor, "B M"]]:
     """log p of the demonstrated controls, and a mask of the games that have a density; log p is zero elsewhere."""
-
-    def linearised(*game: Any) -> tuple[Tensor, Tensor]:
-        return _linearised(energy, damping, *game)
-
+    linearised = partial(_linearised, energy, damping)
     slope, matrix = linearised(scene, parameters, controls)
     # A NaN anywhere in J reaches the diagonal of J^T J.
     finite = (slope + matrix.diagonal(dim1=-2, dim2=-1)).isfinite().all(-1)
