@@ -133,7 +133,8 @@ def _pictures(settings: Settings, run: RunFolder, count: int) -> list[Path]:
         data = assembly.build_data(settings.data)
         scenes, _ = choose(data, "val", max(64, count))
         request = PredictSettings(run=str(run.path), out=str(run.logs), split="val", figures=count)
-        return [path for path, _ in draw(request, settings.title, forecaster, scenes, forecast_of(forecaster, scenes))]
+        forecast = forecast_of(forecaster, scenes)
+        return [path for path, _ in draw(request, settings.title, forecaster.task.shape, scenes, forecast)]
     except Exception as error:  # a run must not fail because a picture cannot be drawn
         print(f"{run.path}: no pictures ({type(error).__name__}: {error})", file=sys.stderr)
         return []

@@ -33,18 +33,19 @@ def pick(dataset: SceneDataset, count: int | None) -> tuple[Scene, list[dict[str
 
 
 def draw(
-    settings: PredictSettings, title: str, forecaster: Any, scenes: Scene, forecast: JointForecast
+    settings: PredictSettings, title: str, shape: str, scenes: Scene, forecast: JointForecast
 ) -> list[tuple[Path, list[int]]]:
     """Draw pictures and animations into ``out``; returns each file with the rows of the scenes that it shows.
 
-    Scenes with lanes, boxes or classes of agents get a picture each. Scenes of equal discs (RPI) share one picture.
+    Scenes with lanes, boxes or classes of agents get a picture each. Scenes of equal discs (RPI) share one picture. The
+    ``shape`` is the outline of agents, that of the forecaster's task.
     """
     folder = Path(settings.out).expanduser() / "figures"
     ids = list(range(len(scenes.history))) if scenes.id is None else scenes.id.tolist()
     if len(set(ids)) < len(ids):  # a record with two futures, say
         ids = list(range(len(ids)))
     drawn: list[tuple[Path, list[int]]] = []
-    if settings.figures and is_traffic(scenes, forecaster.configuration.get("shape", "disc")):
+    if settings.figures and is_traffic(scenes, shape):
         from epo_lightning.report.scenes import highway_scene
 
         for row in eventful(scenes, settings.figures):

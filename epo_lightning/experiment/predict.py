@@ -98,7 +98,7 @@ def predict(settings: PredictSettings, overrides: Sequence[str] = ()) -> list[Pa
     tensors = dict(_tensors(scenes, forecast))
     out.mkdir(parents=True, exist_ok=True)
     write_file(tensors_file, save(tensors))
-    pictures = draw(settings, of_run.title, forecaster, scenes, forecast)
+    pictures = draw(settings, of_run.title, forecaster.task.shape, scenes, forecast)
     index = {
         "run": str(run.path),
         "title": of_run.title,

@@ -197,7 +197,7 @@ def draw(rows: Iterable[Row], folder: Path) -> tuple[list[Path], list[str]]:
         return [], notes
     try:
         first = next(iter(runs))
-        data, shape = open_data(*runs[first]), forecasters[first].configuration.get("shape", "disc")
+        data, shape = open_data(*runs[first]), forecasters[first].task.shape
         # Records with two futures (RPI) are found among all scenes only.
         scenes, _ = choose(data, "test", None if "alternative" in data.task.subsets else GAMES)
     except ConfigError as error:
