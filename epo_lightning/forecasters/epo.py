@@ -17,7 +17,7 @@ from epo_lightning.backbones.base import Backbone
 from epo_lightning.checks import check_choice, check_number
 from epo_lightning.decoders.goals import Goals
 from epo_lightning.decoders.orders import DecodedOrders, Orders
-from epo_lightning.decoders.probabilities import PROBABILITIES, check_probabilities
+from epo_lightning.decoders.probabilities import PROBABILITIES
 from epo_lightning.decoders.weights import Margins
 from epo_lightning.forecast import GameParameters, JointForecast, Solution, Status
 from epo_lightning.forecasters.combination import Combination
@@ -30,7 +30,6 @@ from epo_lightning.forecasters.epo_decoders import (
 from epo_lightning.forecasters.epo_settings import (
     WEIGHTS,
     check_calibration,
-    check_decodes_probabilities,
     check_gate,
     check_horizon,
     check_initial,
@@ -39,6 +38,7 @@ from epo_lightning.forecasters.epo_settings import (
     check_needs,
     check_pair_start,
     check_start,
+    decodes_probabilities,
 )
 from epo_lightning.forecasters.game_forecaster import GameForecaster
 from epo_lightning.forecasters.repeats import repeats_joined, without_repeated_choices
@@ -145,10 +145,7 @@ class EPO(GameForecaster):
         check_choice("forecaster.own_weights", own_weights, WEIGHTS)
         check_choice("forecaster.pair_weights", pair_weights, WEIGHTS)
         check_gate(gate, energy)
-        # The network decodes probabilities, except where they follow from energies of candidates (TABLES) or from orders.
-        defined = TABLES in solver.provides or energy.pair_order is not None
-        check_probabilities(probabilities)
-        check_decodes_probabilities(probabilities, energy, solver)
+        decoded = decodes_probabilities(probabilities, energy, solver)
         check_pair_start(pair_start, positive=one_game or pair_weights == "shared")
         check_number("forecaster.control_scale", control_scale)
         super().__init__(task, optimizer)
@@ -174,7 +171,7 @@ class EPO(GameForecaster):
         variants = games if order is None or TABLES in solver.provides else modes
         self.goals = goals_decoder(energy, task, width, variants)
         self.orders = None if order is None else Orders(width, variants, order.symmetric)
-        self.probabilities = None if defined else PROBABILITIES[probabilities](width, modes, task.horizon, scale)
+        self.probabilities = PROBABILITIES[probabilities](width, modes, task.horizon, scale) if decoded else None
         # Built last: decoders of margins and gates must not change the initial weights of the networks above.
         limits = check_margin(margin)
         names = energy.decoded_margins

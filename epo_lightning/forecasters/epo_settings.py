@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from epo_lightning.checks import check_choice, check_number
+from epo_lightning.decoders.probabilities import check_probabilities
 from epo_lightning.forecasters.calibration import Calibration
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.energy import FEATURES, Energy
@@ -152,18 +153,21 @@ def check_gate(gate: Mapping[str, Any] | None, energy: Energy) -> None:
         raise ConfigError("forecaster.gate chooses pairs, but energy.pair is empty: set forecaster.gate to null")
 
 
-def check_decodes_probabilities(probabilities: str, energy: Energy, solver: Minimiser) -> None:
-    """Refuse a decoder of probabilities where energies of choices or orders of agents define them.
+def decodes_probabilities(probabilities: str, energy: Energy, solver: Minimiser) -> bool:
+    """Whether the network decodes the modes' probabilities; otherwise energies of choices or orders of agents define them.
 
     Raises:
-        ConfigError: see above.
+        ConfigError: an unknown decoder, or a chosen one where none is used.
     """
+    check_probabilities(probabilities)
     chooses = TABLES in solver.provides
-    if probabilities != "linear" and (chooses or energy.pair_order is not None):
+    defined = chooses or energy.pair_order is not None
+    if defined and probabilities != "linear":
         raise ConfigError(
             f"forecaster.probabilities={probabilities} has no effect here, because the "
             f"{'energies of choices' if chooses else 'orders of agents'} define the probabilities: leave it out"
         )
+    return not defined
 
 
 def check_motions(motions: Mapping[str, float] | None) -> dict[str, float]:
