@@ -27,7 +27,7 @@ from epo_lightning.data.simulate.lanelets import write_map
 from epo_lightning.data.simulate.layout import LAYOUTS, Layout
 from epo_lightning.data.simulate.motion import SLOWEST, strip_at
 from epo_lightning.data.simulate.traffic import simulator
-from epo_lightning.drive.ride import Moment, Position
+from epo_lightning.drive.ride import WINDOWS, Moment, Position
 from epo_lightning.drive.sumo_process import END, OWN, STEP, Branch, Vehicles, serve
 from epo_lightning.drive.traffic import TrafficWorld
 from epo_lightning.registry import ConfigError, nearest
@@ -92,7 +92,7 @@ class SumoSimulator:
         if not hasattr(os, "fork"):
             raise ConfigError("world=sumo branches episodes off by os.fork, which Linux and macOS have")
         self._episodes, self._seed, self._style = episodes, (SEEDS + seed) * APART, style
-        self.steps = round(SECONDS * 5)
+        self.steps = round(SECONDS / WINDOWS.dt)
         self._maps: dict[int, LaneGraph] = {}
 
     def __len__(self) -> int:
