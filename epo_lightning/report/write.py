@@ -205,17 +205,23 @@ def write_report(
         save(chart.draw(chart.wide, True), out / "figures" / f"{chart.name}.png")
     for name, text in files.items():
         write_file(out / name, text)
-    console = console or Console()
+    _print(console or Console(), notes, [*tables, *transfer, *costs, *shown], report.left_out)
+    return markdown
+
+
+def _print(
+    console: Console, notes: Sequence[str], tables: Sequence[Table | Sheet], left_out: Sequence[tuple[str, str]]
+) -> None:
+    """Print the tables between the notes and a summary of the runs that were left out."""
     for note in notes:
         console.print(note, style="yellow", markup=False, highlight=False, soft_wrap=True)
     terminal = console.width
-    for rich in (*map(to_rich, tables), *map(to_rich, transfer), *map(to_rich, costs), *map(to_rich, shown)):
+    for rich in map(to_rich, tables):
         console.width = max(terminal, least_width(rich))  # a long line is better than a row without its name
         console.print(rich)
     console.width = terminal
-    if report.left_out:
-        console.print(_summary(report.left_out), style="yellow", markup=False, highlight=False, soft_wrap=True)
-    return markdown
+    if left_out:
+        console.print(_summary(left_out), style="yellow", markup=False, highlight=False, soft_wrap=True)
 
 
 def _caveat(tables: Sequence[Table]) -> str:
