@@ -214,12 +214,16 @@ class Sweep:
             if not job.lacking:
                 return "done"
             state = "running" if job.run.locked else "trained, not scored"
-        return "failed" if state not in ("running", "failed") and self._failure(job.run).is_file() else state
+        return "failed" if state not in ("running", "failed") and self.has_traceback(job) else state
+
+    def has_traceback(self, job: Job) -> bool:
+        """Whether the run has failed since the last start of the sweep."""
+        return self._failure(job.run).is_file()
 
     def error(self, job: Job) -> str:
         """Error message of a failed run in one line; empty if it has not failed."""
         try:
-            if self._failure(job.run).is_file():
+            if self.has_traceback(job):
                 return self._failure(job.run).read_text(encoding="utf-8").partition("\n")[0]
             return str(job.run.record.get("error") or "") if job.run.record_file.is_file() else ""
         except ConfigError as error:

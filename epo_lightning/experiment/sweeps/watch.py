@@ -190,20 +190,26 @@ def result(job: Job) -> str:
 
 @contextmanager
 def news(sweep: Sweep) -> Iterator[None]:
-    """Context that prints a line whenever a run is done or has failed, in whatever process or machine it ran."""
+    """Context that prints a line whenever a run is done or has failed, in whatever process or machine it ran.
+
+    A run that an earlier start left as failed is not over: its traceback is deleted when the sweep begins again, and a new
+    one means that it has failed again.
+    """
     names = names_of(sweep.jobs)
     known = {job.run.path: sweep.state(job) for job in sweep.jobs}
+    ended: dict[Path, State] = {path: state for path, state in known.items() if state == "done"}
     over = threading.Event()
 
     def look() -> None:
         jobs = sweep.jobs
         for job in jobs:
             state = sweep.state(job)
-            if state != known.get(job.run.path) and state in ("done", "failed"):
-                done = sum(known.get(other.run.path) in ("done", "failed") for other in jobs) + 1
+            new = state != known.get(job.run.path) or sweep.has_traceback(job)
+            if new and state in ("done", "failed") and state != ended.get(job.run.path):
+                ended[job.run.path] = state
                 text = f"FAILED, {sweep.error(job)}" if state == "failed" else f"done, {result(job)}"
                 name = names.get(job.run.path) or names_of(jobs)[job.run.path]
-                print(f"[{done}/{len(jobs)}] {name}: {text}", flush=True)
+                print(f"[{len(ended)}/{len(jobs)}] {name}: {text}", flush=True)
             known[job.run.path] = state
 
     def watch() -> None:

@@ -127,6 +127,16 @@ def test_a_failed_run_is_reported_and_does_not_stop_the_others(epo: Epo, capsys:
     assert all(job.run.record["status"] == "failed" for job in sweep.jobs if sweep.state(job) == "failed")
 
 
+def test_a_run_that_fails_again_is_reported_again(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
+    words = (*SWEEP, "optimizer.lr=1e25")
+    assert epo(*words) == 1
+    capsys.readouterr()
+    assert epo(*words) == 1
+    news = re.findall(r"^\[(\d)/8\] .*, seed \d: (\w+)", capsys.readouterr().out, re.MULTILINE)
+    # Two runs of constant velocity are done already.
+    assert news == [(str(number), "FAILED") for number in range(3, 9)]
+
+
 def test_a_sweep_stops_at_a_failure_if_asked_to(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
     assert epo(*SWEEP, "optimizer.lr=1e25", "--stop-on-failure") == 1
     assert "2 done, 1 failed, 5 waiting" in capsys.readouterr().out
