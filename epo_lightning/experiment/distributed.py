@@ -174,7 +174,7 @@ class _Processes(_Launcher):
         """Result of ``function``, called while the followers run.
 
         Raises:
-            RuntimeError: a follower has failed.
+            ChildProcessError: a follower has failed.
         """
         try:
             if self._place.leads:
@@ -196,7 +196,8 @@ class _Processes(_Launcher):
         """The store, once all processes have connected to it.
 
         Raises:
-            RuntimeError: a process failed, or did not connect in time.
+            ChildProcessError: a process failed.
+            RuntimeError: a process did not connect in time.
         """
         assert self._store is not None
         self._store.set(f"here/{self._place.rank}", "")
@@ -244,8 +245,11 @@ class _Processes(_Launcher):
                 torch.distributed.distributed_c10d._get_default_group().abort()
                 return
 
-    def _failure(self) -> RuntimeError | None:
-        """Error with exit status and last line of the first follower that failed; None if none has."""
+    def _failure(self) -> ChildProcessError | None:
+        """Error with exit status and last line of the first follower that failed; None if none has.
+
+        It is an OSError, so that the command ends with one line: the leader's traceback says nothing about the follower.
+        """
         for rank, (process, errors) in enumerate(self._followers, 1):
             code = process.poll()
             if code:
@@ -253,7 +257,7 @@ class _Processes(_Launcher):
                 said = errors.read().decode(errors="replace").strip()
                 how = f"was killed by signal {-code}" if code < 0 else f"ended with exit status {code}"
                 reason = f": {said.splitlines()[-1]}" if said else ""
-                return RuntimeError(f"process {rank} of the run's {self._place.world} {how}{reason}")
+                return ChildProcessError(f"process {rank} of the run's {self._place.world} {how}{reason}")
         return None
 
     def _wait(self, patience: float = GRACE) -> None:
