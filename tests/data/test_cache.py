@@ -203,6 +203,22 @@ def test_a_full_disk_is_an_error_that_names_the_file(tmp_path, monkeypatch):
         assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("place", ["cache", "cache/rpi-1"])
+def test_a_link_to_nowhere_is_named_with_its_remedy(tmp_path, place):
+    link = tmp_path / place
+    link.parent.mkdir(exist_ok=True)
+    link.symlink_to(tmp_path / "gone")
+    folder = tmp_path / "cache" / "rpi-1"
+
+    def make():
+        cache.write(folder, {"val": {"a": torch.zeros(1)}}, {}, {})
+
+    with pytest.raises(
+        OSError, match=rf"{place} is a link to .*gone, which does not exist: make that folder, or remove"
+    ):
+        cache.make_once(folder, make)
+
+
 def test_a_process_waits_while_another_one_makes_the_folder(tmp_path):
     code = (
         "import pathlib\n"
