@@ -102,6 +102,11 @@ class RecordedData(SceneDataModule):
     ) -> None:
         super().__init__(batch_size, seed, share)
         self.dataset_name, self.format, self.folder_of_recordings = dataset, format, Path(folder).expanduser()
+        if not str(dataset) or str(dataset).startswith(".") or "/" in str(dataset):
+            raise ConfigError(
+                f"data.dataset must be a name without slashes and without a point at its beginning, not {dataset!r}: "
+                "folders in the cache are named after it"
+            )
         self.options = dict(options or {})
         self.list_sources, self.reader = with_options(format, self.options), code_of(format)
         self.windows = read(WindowConfig, windows, "data.windows")

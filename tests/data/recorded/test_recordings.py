@@ -291,6 +291,11 @@ def test_missing_data_and_misspelt_keys_name_the_remedy(folder, tmp_path):
         ({"windows": {"radius": "far"}}, "data.windows.radius must be a number or null, not 'far'"),
         ({"format": "raods"}, "did you mean 'roads'"),
         ({"frame": "moving"}, "unknown data.frame"),
+        (
+            {"dataset": "../roads"},
+            r"data\.dataset must be a name without slashes.* not '\.\./roads': folders in the cache",
+        ),
+        ({"dataset": ""}, r"data\.dataset must be a name"),
         ({"map": False}, "lane_change asks for lanes"),
         ({"val_share": 1.5}, "share between 0 and 1"),
     ):
