@@ -78,6 +78,7 @@ def ucy(folder: Path, video_rate: float | None = None) -> list[RecordingSource]:
 def _read_recording(path: Path, name: str, video_rate: float | None = None) -> Recording:
     dropped: Counter[str] = Counter()
     table = _table(path)
+    _check_axes(table, path)
     table = table[np.lexsort((table[:, 0], table[:, 1]))]
     step = _step(table, path)
     table, index = _annotated(table, step, dropped)
@@ -96,6 +97,18 @@ def _read_recording(path: Path, name: str, video_rate: float | None = None) -> R
         kind=np.full(len(ids), KINDS.index("pedestrian")),
     )
     return Recording(name, name, tracks.check(path), lanes=None, dropped=dict(dropped))
+
+
+def _check_axes(table: Float[np.ndarray, "T 8"], path: Path) -> None:
+    """Check that pedestrians move along y rather than upwards, as they seem to do where y and z are exchanged."""
+    for across, up in (("y", "z"), ("vy", "vz")):
+        same, differ = (table[:, COLUMNS.index(name)] for name in (across, up))
+        if not np.ptp(same) and np.ptp(differ):
+            raise RecordingError(
+                path,
+                f"{across} is {same[0]:g} in all rows, and {up} is not the same: z is up, and columns were expected in the "
+                f"order {', '.join(COLUMNS)}; are {across} and {up} exchanged?",
+            )
 
 
 def _step(table: Float[np.ndarray, "T 8"], path: Path) -> int:

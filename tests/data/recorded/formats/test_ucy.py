@@ -147,6 +147,11 @@ def test_rows_between_the_annotated_frames_are_left_out_and_counted(tmp_path):
         (ROWS.replace("-1.0", "-999"), "velocity"),
         ("1 1 0 0 0 0 0 0\n1 2 0 0 0 0 0 0", "all rows are of one frame"),
         ("0 1 0 0 0 0 0 0\n100 1 0 0 0 0 0 0", "a frame rate of 0.25 Hz"),
+        ("0 1 0 5 0 1 .5 0\n10 1 .4 5.2 0 1 .5 0", "y is 0 in all rows, and z is not the same: z is up.* are y and z"),
+        (
+            "0 1 0 0 5 1 .5 0\n10 1 .4 0 5.2 1 .4 0",
+            "vy is 0 in all rows, and vz is not the same.* are vy and vz exchanged",
+        ),
     ],
 )
 def test_invalid_files_are_refused(tmp_path, content, message):
