@@ -10,8 +10,8 @@ Listing must be cheap; a :class:`RecordingSource` reads its files when its ``rea
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -141,6 +141,18 @@ class TrackTable:
                 f"and at most {LONGEST:g} m: are they in another unit?",
             )
         return self
+
+
+def together(parts: Sequence[TrackTable]) -> TrackTable:
+    """The agents of several tables of one recording in one table, one table after the other; all have the same rate."""
+    agents = np.cumsum([0, *(len(part.ids) for part in parts[:-1])])
+    columns = {
+        field.name: np.concatenate([getattr(part, field.name) for part in parts])
+        for field in fields(TrackTable)
+        if field.name not in ("rate", "agent")
+    }
+    agent = np.concatenate([part.agent + before for part, before in zip(parts, agents, strict=True)])
+    return TrackTable(rate=parts[0].rate, agent=agent, **columns)
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from epo_lightning.data.errors import RecordingError
 from epo_lightning.data.recorded.formats.motion import check_motion, direction_of_motion
 from epo_lightning.data.recorded.formats.tables import FLOAT, INT, TEXT, Types, raise_first, read_table
 from epo_lightning.data.recorded.kinds import typical_sizes
-from epo_lightning.data.recorded.tracks import Recording, RecordingSource, TrackTable, unwrapped
+from epo_lightning.data.recorded.tracks import Recording, RecordingSource, TrackTable, together, unwrapped
 from epo_lightning.registry import ConfigError, register
 from epo_lightning.scene import KINDS
 
@@ -101,19 +101,7 @@ def _read_recording(name: str, group: str, tables: dict[str, Path], rate: float)
     dropped: Counter[str] = Counter({f"clips without a table of {NAMES[of]}": 1 for of in NAMES if of not in tables})
     # Pedestrians come first, because their ids are below those of vehicles.
     parts = [_numbered(_tracks(tables[label], label, rate), label) for label in NAMES if label in tables]
-    agents = np.cumsum([0, *(len(part.ids) for part in parts[:-1])])
-    tracks = TrackTable(
-        rate=rate,
-        agent=np.concatenate([part.agent + before for part, before in zip(parts, agents, strict=True)]),
-        frame=np.concatenate([part.frame for part in parts]),
-        position=np.concatenate([part.position for part in parts]),
-        heading=np.concatenate([part.heading for part in parts]),
-        velocity=np.concatenate([part.velocity for part in parts]),
-        ids=np.concatenate([part.ids for part in parts]),
-        size=np.concatenate([part.size for part in parts]),
-        kind=np.concatenate([part.kind for part in parts]),
-    )
-    return Recording(name, group, tracks, lanes=None, dropped=dict(dropped))
+    return Recording(name, group, together(parts), lanes=None, dropped=dict(dropped))
 
 
 def _numbered(tracks: TrackTable, label: str) -> TrackTable:

@@ -26,7 +26,7 @@ from epo_lightning.data.recorded.formats import lanelet2
 from epo_lightning.data.recorded.formats.motion import check_motion, direction_of_motion
 from epo_lightning.data.recorded.formats.tables import FLOAT, TEXT, Types, raise_first, read_table
 from epo_lightning.data.recorded.kinds import completed_sizes, kinds_of
-from epo_lightning.data.recorded.tracks import Recording, RecordingSource, TrackTable, unwrapped
+from epo_lightning.data.recorded.tracks import Recording, RecordingSource, TrackTable, together, unwrapped
 from epo_lightning.registry import register
 
 RATE = 10.0
@@ -112,8 +112,25 @@ def _source(name: str, place: str, files: _Files) -> RecordingSource:
 
 def _read_recording(name: str, place: str, files: _Files) -> Recording:
     dropped: Counter[str] = Counter()
-    path = files.tables[0]
-    rows = pl.concat([_rows(table) for table in files.tables]).sort("id", "frame")
+    parts = [_tracks(table, dropped) for table in files.tables]
+    for part in parts[1:]:
+        if len(twice := np.intersect1d(parts[0].ids, part.ids)):
+            raise RecordingError(
+                files.tables[1], f"track {twice[0]} is in {files.tables[0].name} too: give it another id"
+            )
+    tracks = together(parts)
+    check_motion(
+        tracks, " and ".join(map(str, files.tables)), "vx and vy", f"{RATE:g} frames per second", unit="radians"
+    )
+    lanes = None
+    if files.map is not None:
+        lanes = lanelet2.read_map(files.map, ORIGIN, zone=ZONE, dropped=dropped, north=True)
+    return Recording(name, place, tracks, lanes, dict(dropped))
+
+
+def _tracks(path: Path, dropped: Counter[str]) -> TrackTable:
+    """The tracks of one table, checked by themselves, so that errors name the table."""
+    rows = _rows(path).sort("id", "frame")
     ids, first, agent = np.unique(rows["id"].to_numpy(), return_index=True, return_inverse=True)
     kind = kinds_of(rows["agent_type"].gather(first), dropped, CLASSES)
     size = completed_sizes(
@@ -124,7 +141,7 @@ def _read_recording(name: str, place: str, files: _Files) -> Recording:
     heading[without] = direction_of_motion(
         np.unique(agent[without], return_inverse=True)[1], velocity[without], SLOWEST
     )
-    tracks = TrackTable(
+    return TrackTable(
         rate=RATE,
         agent=agent,
         frame=rows["frame"].to_numpy(),
@@ -135,11 +152,6 @@ def _read_recording(name: str, place: str, files: _Files) -> Recording:
         size=size,
         kind=kind,
     ).check(path)
-    check_motion(tracks, path, "vx and vy", f"{RATE:g} frames per second", unit="radians")
-    lanes = None
-    if files.map is not None:
-        lanes = lanelet2.read_map(files.map, ORIGIN, zone=ZONE, dropped=dropped, north=True)
-    return Recording(name, place, tracks, lanes, dict(dropped))
 
 
 def _rows(path: Path) -> pl.DataFrame:

@@ -207,3 +207,20 @@ def test_damaged_tables_give_only_recording_errors(tmp_path, trials, layout):
     folder = layout(tmp_path / "interaction", suffix="")
     (source,) = interaction(folder)
     damage(lambda: read(folder), folder, source.files, trials, lambda found, label: check(found, folder, label))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("1009.370,992.770", "1809.370,992.770"), "track 1000001 jumps from"),
+        (("-0.9,1.1", "-900,1100"), "velocity .* of track 1000001 .* is it in another unit"),
+        (("P1,", "1,"), r"track 1 is in vehicle_tracks_000\.csv too: give it another id"),
+    ],
+)
+def test_errors_of_pedestrians_name_their_table(tmp_path, change, message):
+    folder = write_recording(tmp_path)
+    path = next(folder.rglob("pedestrian_tracks_000.csv"))
+    assert change[0] in path.read_text()
+    path.write_text(path.read_text().replace(*change))
+    with pytest.raises(RecordingError, match=rf"pedestrian_tracks_000\.csv: {message}"):
+        read(folder)
