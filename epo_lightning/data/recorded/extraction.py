@@ -21,7 +21,7 @@ from safetensors.numpy import save
 
 from epo_lightning.data import cache
 from epo_lightning.data.errors import RecordingError
-from epo_lightning.data.recorded.plausibility import doubts
+from epo_lightning.data.recorded.plausibility import doubts, doubts_of_lanes
 from epo_lightning.data.recorded.surroundings import far_from_lanes
 from epo_lightning.data.recorded.tracks import Recording, RecordingSource
 from epo_lightning.data.recorded.windows import WindowConfig, extract
@@ -98,6 +98,8 @@ def _extract(
                 raise RecordingError(source.name, "the recording has no map: set data.map=false, or give it one")
             if not has_map:
                 recording = dataclasses.replace(recording, lanes=None)
+            for doubt in doubts_of_lanes(recording.lanes) if recording.lanes is not None else ():
+                warnings.warn(doubt, stacklevel=1)
             found, counts = extract(recording, windows)
         except RecordingError as error:
             if strict or _may_be_readable(source, error):

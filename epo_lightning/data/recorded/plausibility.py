@@ -1,4 +1,7 @@
-"""Doubts about the tracks of a recording: values that are allowed, and nearly always a mistake of units, axes or frames."""
+"""Doubts about the tracks and lanes of a recording: values that are allowed, and nearly always a mistake.
+
+Tracks may have another unit, other axes or other frames, and lines of lanes may have points in another order.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from epo_lightning.data.recorded.lanes import LaneGraph
 from epo_lightning.data.recorded.tracks import TrackTable
 from epo_lightning.scene import KINDS
 
@@ -33,6 +37,33 @@ AWAY, STILL = 5.0, 0.1
 """Way [m] from which on an agent has moved, and the share of it below which its velocities say that it stands."""
 JUMP = 3.0
 """Largest distance [m] of the end of a step from where the velocities lead; 1.3 m occur in real recordings."""
+TURNS, PIECE = 2, 0.1
+"""Smallest number of turns by more than 90 degrees of a line that is doubted, and length [m] from which on a piece beside
+such a turn counts. Lines in real maps have no such turn."""
+
+
+def doubts_of_lanes(lanes: LaneGraph) -> list[str]:
+    """A sentence on lines of lanes that turn back several times, as lines do whose points are in another order."""
+    wrong = [
+        f"the {name} line of lane {lane}"
+        for name in ("left", "right", "centre")
+        for lane, line in zip(lanes.ids, getattr(lanes, name), strict=True)
+        if _turns_back(line) >= TURNS
+    ]
+    if not wrong:
+        return []
+    return [
+        f"{len(wrong)} lines of lanes turn back by more than 90 degrees {TURNS} times or more, the first one is {wrong[0]}: "
+        "are their points in the order of driving?"
+    ]
+
+
+def _turns_back(line: Float[np.ndarray, "n 2"]) -> int:
+    """Number of points at which a line turns by more than 90 degrees between two pieces that are not tiny."""
+    step = np.diff(line, axis=0)
+    clear = _length(step) > PIECE
+    back = (step[1:] * step[:-1]).sum(-1) < 0
+    return int((back & clear[1:] & clear[:-1]).sum())
 
 
 def doubts(tracks: TrackTable) -> list[str]:
