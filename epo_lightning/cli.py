@@ -12,6 +12,7 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -238,7 +239,12 @@ def _single(arguments: Arguments) -> None:
     config = compose(arguments.verb, words, arguments.extra)
     from epo_lightning.experiment import verbs
 
-    verbs.RUN[arguments.verb](config, [*words, *(f"--config-dir={folder}" for folder in arguments.extra)])
+    verbs.RUN[arguments.verb](config, [*words, *_options(arguments)])
+
+
+def _options(arguments: Arguments) -> list[str]:
+    """The options of the command without which its words cannot be composed again, for the records of runs."""
+    return [f"--config-dir={folder}" for folder in arguments.extra]
 
 
 def _resume(folder: str, others: Sequence[str]) -> None:
@@ -263,6 +269,7 @@ def _multirun(arguments: Arguments) -> None:
     from epo_lightning.experiment.config import compose
 
     listed = compose.jobs("train", arguments.overrides, arguments.extra)
+    task = partial(job_of_sweep, options=_options(arguments))
     if listed:
         from epo_lightning.experiment import assembly, train
         from epo_lightning.experiment.config.settings import Settings
@@ -273,11 +280,11 @@ def _multirun(arguments: Arguments) -> None:
             data, _ = assembly.check_buildable(settings)
             train.refuse_occupied(settings, train.folder_for(settings), data.digest)
         print(f"{len(listed)} runs")
-        for done in compose.launch("train", arguments.overrides, listed, job_of_sweep, arguments.extra):
+        for done in compose.launch("train", arguments.overrides, listed, task, arguments.extra):
             if isinstance(done._return_value, Exception):
                 raise done._return_value  # Hydra's `done.return_value` would print the overrides before it raises
         return
-    compose.multirun("train", arguments.overrides, job_of_sweep, arguments.extra)
+    compose.multirun("train", arguments.overrides, task, arguments.extra)
 
 
 def _one_after_the_other(arguments: Arguments) -> None:
@@ -319,12 +326,17 @@ def _sweep(arguments: Arguments) -> None:
     if action == "generate":
         sweeping.generate(name, words, arguments.extra)
         return
-    if not sweeping.run(name, words, arguments.extra, job_of_sweep, arguments.stop_on_failure):
+    task = partial(job_of_sweep, options=_options(arguments))
+    if not sweeping.run(name, words, arguments.extra, task, arguments.stop_on_failure):
         raise SystemExit(1)
 
 
-def job_of_sweep(config: DictConfig) -> float | None:
+def job_of_sweep(config: DictConfig, options: Sequence[str] = ()) -> float | None:
     """Train one run of a sweep or multirun. At module level, so that launchers can send it to other processes.
+
+    Args:
+        config: configuration of the run.
+        options: options of the command line, which the run's record repeats.
 
     Returns:
         the best validation score, which a searching sweeper (Optuna) minimises.
@@ -341,8 +353,8 @@ def job_of_sweep(config: DictConfig) -> float | None:
     if values.get("sweep"):
         from epo_lightning.experiment.sweeps.sweep import Sweep
 
-        return Sweep(Path(values["sweep"])).work(values, overrides)
-    return verbs.train_and_print(values, overrides)
+        return Sweep(Path(values["sweep"])).work(values, overrides, options)
+    return verbs.train_and_print(values, [*overrides, *options])
 
 
 if __name__ == "__main__":

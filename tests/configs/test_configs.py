@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 import re
+import shlex
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -283,6 +284,16 @@ def test_the_working_folder_can_have_the_configurations(epo: Epo, tmp_path: Path
     assert epo(*words, "runs=runs") == 0
     (record,) = (tmp_path / "runs" / "sweeps").glob("mine-*/sweep.json")
     assert read_json(record)["command"].endswith("--config-dir=."), "the same command can be given again"
+    row = tmp_path / "experiment" / "own.yaml"
+    row.parent.mkdir()
+    row.write_text("# @package _global_\ndefaults: [/experiment/rpi/const_vel@_here_]\ntitle: Own\n")
+    file.write_text(file.read_text().replace("rpi/const_vel", "own"))
+    assert epo(*words, "runs=own_runs") == 0
+    (run,) = (tmp_path / "own_runs").rglob("run.json")
+    command = shlex.split(read_json(run)["command"])
+    assert command[-1] == "--config-dir=.", "the command of each of its runs as well"
+    assert epo(*command[1:], "run_dir=again") == 0
+    assert read_json(tmp_path / "again" / "run.json")["identity"] == read_json(run)["identity"]
     (tmp_path / "results").mkdir()
     assert epo("report", "--config-dir=.", "scenes=false", "runs=runs", "save=results/mine.json") == 0
     assert epo("report", "--config-dir=.", "results=results/mine.json") == 0

@@ -160,6 +160,7 @@ def test_recorded_commands_can_be_given_to_a_shell(epo: Epo) -> None:
     assert epo("train", "-m", ROW, *TINY, titles[0], "seed=0") == 0
     (run,) = Path("runs").rglob("run.json")
     words = shlex.split(RunFolder(run.parent).record["command"])
+    assert words[-1] == f"--config-dir={tiny.CONF}"
     title = RunFolder(run.parent).record["title"]
     assert title == "it's"
     assert epo("train", *words[2:], "run_dir=again") == 0

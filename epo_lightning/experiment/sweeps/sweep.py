@@ -298,8 +298,13 @@ class Sweep:
         """Record that the process of a run died without an error message."""
         write_file(self._failure(job.run), "its process was killed in every attempt (out of memory?)\n")
 
-    def work(self, config: Mapping[str, Any], overrides: Sequence[str]) -> float | None:
+    def work(self, config: Mapping[str, Any], overrides: Sequence[str], options: Sequence[str]) -> float | None:
         """Train and score one of the runs. A launcher calls this in a process of its choice.
+
+        Args:
+            config: configuration of the run.
+            overrides: overrides of the run.
+            options: options of the sweep's command line, which the run's record repeats.
 
         Returns:
             the best validation score; None for a run that is skipped because another one failed (``--stop-on-failure``).
@@ -322,7 +327,7 @@ class Sweep:
             if not record["jobs"]:
                 name = self._failure(run).with_suffix(".json").name
                 write_json(self.folder / "found" / name, self._entry(Job.of(config, overrides)))
-            training.train(dict(config), overrides)
+            training.train(dict(config), [*overrides, *options])
         except Exception as error:
             message = mask(f"{type(error).__name__}: {' '.join(str(error).split())}")
             message = message.replace(f"{self.root}{os.sep}", f"{os.path.relpath(self.root)}{os.sep}")
