@@ -38,14 +38,19 @@ def controls_between(states: Float[Tensor, "*batch T 4"], dt: float) -> Float[Te
 
 
 @runtime_checkable
-class Dynamics(Protocol):
-    """The interface of dynamics: the map from controls to states, for every agent independently of the others."""
+class Rollout(Protocol):
+    """The map from controls to states, for every agent independently of the others."""
 
     def rollout(
         self, initial: Float[Tensor, "*#batch 4"], controls: Float[Tensor, "*batch K 2"], dt: float
     ) -> Float[Tensor, "*batch K 4"]:
         """The states x_1 .. x_K that piecewise constant controls u_0 .. u_{K-1} lead to from x_0."""
         ...
+
+
+@runtime_checkable
+class Dynamics(Rollout, Protocol):
+    """The interface of dynamics whose derivative is known too."""
 
     def tangent(
         self, states: Float[Tensor, "*batch K 4"], direction: Float[Tensor, "directions *batch K 2"], dt: float

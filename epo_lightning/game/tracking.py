@@ -12,28 +12,15 @@ are kept. Where the rollout of the guess u already matches the recording, c is z
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
-
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from epo_lightning.game.dynamics import Unicycle
+from epo_lightning.game.dynamics import Rollout, Unicycle
 from epo_lightning.scene import HEADING, SPEED, Scene, wrapped
 
 _SMOOTHNESS = 1e-2
 """mu relative to the mean of a channel's diagonal entries of J^T J, so that it has no unit."""
-
-
-@runtime_checkable
-class Rollout(Protocol):
-    """The part of dynamics that tracking needs."""
-
-    def rollout(
-        self, initial: Float[Tensor, "*#batch 4"], controls: Float[Tensor, "*batch K 2"], dt: float
-    ) -> Float[Tensor, "*batch K 4"]:
-        """The states x_1 .. x_K that controls u_0 .. u_{K-1} lead to from x_0."""
-        ...
 
 
 def observed_controls(
