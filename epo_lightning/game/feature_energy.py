@@ -288,7 +288,7 @@ class FeatureEnergy(FeatureInputs):
         super().validate(scene, parameters, controls)
         check_inputs(self, scene, parameters, controls)
 
-    def finite(self, scene: Scene, parameters: GameParameters) -> Bool[Tensor, "B M"]:
+    def finite_inputs(self, scene: Scene, parameters: GameParameters) -> Bool[Tensor, "B M"]:
         """Mask of the games whose inputs are finite.
 
         A NaN of most inputs reaches the controls and is found there. This mask checks the others, whose NaN or infinity may

@@ -28,7 +28,7 @@ def _object(value: Any) -> bool:
     return isinstance(value, Mapping)
 
 
-def _finite(value: Any) -> bool:
+def _finite_number(value: Any) -> bool:
     return _number(value) and not isinstance(value, bool) and math.isfinite(value)
 
 
@@ -58,7 +58,7 @@ OBJECTS: Check = "a list of objects", lambda value: _all(value, _object)
 OBJECTS_BY_NAME: Check = "objects by name", lambda value: _object(value) and all(map(_object, value.values()))
 NUMBERS_BY_NAME: Check = "numbers by name", lambda value: _object(value) and all(map(_number, value.values()))
 
-NUMBER: Check = "a finite number", _finite
+NUMBER: Check = "a finite number", _finite_number
 WHOLE: Check = "a whole number", _whole
 VERSIONS: Check = (
     "texts by name",

@@ -76,7 +76,7 @@ def equilibrium(energy: Energy, scene: Scene, forecast: JointForecast) -> Equili
     mode = forecast.probabilities.argmax(1)
     initial = _of_mode(solution.initial_energy, mode)[:, 0].double()
     if solution.tables is not None and solution.assignment is not None:
-        return _finite(scene.agent_mask, solution.tables, solution.assignment, mode, initial)
+        return _of_candidates(scene.agent_mask, solution.tables, solution.assignment, mode, initial)
     if GRADIENT not in energy.offers:
         return None
     descend: Descend = descend_features if FEATURES in energy.offers else _descend_any
@@ -200,7 +200,7 @@ def _descend_any(energy: Energy, scene: Scene, game: GameParameters, agent: Int[
     return Descent(found.before, found.after, controls, found.slope, found.found)
 
 
-def _finite(
+def _of_candidates(
     mask: Bool[Tensor, "B N"],
     tables: Tables,
     assignment: Int[Tensor, "B M N"],

@@ -69,7 +69,7 @@ def enumerate_(
     digits = [likelihood.view(batch, count**i, count, count ** (agents - 1 - i)) for i in range(agents)]
     marginals = [log_sum_exp(digit, (1, 3)) for digit in digits]
     stacked = torch.stack(marginals, 1) if marginals else unary
-    return stacked - _finite(total)[:, None, None], total
+    return stacked - _finite_or_zero(total)[:, None, None], total
 
 
 def sum_product(
@@ -100,7 +100,7 @@ def sum_product(
     first, second = pairs(agents, unary.device)
     linked = (mask[:, first] & mask[:, second])[..., None]
     # Shifting every agent's lowest energy to zero changes neither log Z nor the marginals, but reduces rounding errors.
-    lowest = _finite(unary.detach().amin(2))
+    lowest = _finite_or_zero(unary.detach().amin(2))
     local = lowest[..., None] - unary
     forth = back = unary.new_zeros(batch, len(first), count)
     for _ in range(iterations):
@@ -118,10 +118,12 @@ def sum_product(
     of_pairs = log_sum_exp(from_first[..., :, None] + from_second[..., None, :] - pair, (2, 3))
     degrees = torch.zeros_like(of_agents)
     degrees = degrees.index_add(1, first, linked[..., 0].to(unary)).index_add(1, second, linked[..., 0].to(unary))
-    bethe = torch.where(linked[..., 0], _finite(of_pairs), 0.0).sum(1) + ((1.0 - degrees) * _finite(of_agents)).sum(1)
+    bethe = torch.where(linked[..., 0], _finite_or_zero(of_pairs), 0.0).sum(1) + (
+        (1.0 - degrees) * _finite_or_zero(of_agents)
+    ).sum(1)
     possible = of_agents.isfinite().all(1) & (of_pairs.isfinite() | ~linked[..., 0]).all(1)
     total = torch.where(possible, bethe - lowest.sum(1), -torch.inf)
-    return belief - _finite(of_agents)[..., None], total
+    return belief - _finite_or_zero(of_agents)[..., None], total
 
 
 def partition(
@@ -177,19 +179,19 @@ def best(
 
 def log_sum_exp(values: Float[Tensor, "..."], dims: tuple[int, ...]) -> Float[Tensor, "..."]:
     """log sum exp, with a gradient of zero where all entries are -inf (PyTorch's gradient is NaN there)."""
-    top = _finite(values.detach().amax(dims, keepdim=True))
+    top = _finite_or_zero(values.detach().amax(dims, keepdim=True))
     total = (values - top).exp().sum(dims)
     none = total == 0
     return torch.where(none, -torch.inf, torch.where(none, 1.0, total).log() + top.view(total.shape))
 
 
-def _finite(values: Tensor) -> Tensor:
+def _finite_or_zero(values: Tensor) -> Tensor:
     """The values with zero in place of infinities and NaN."""
     return torch.where(values.isfinite(), values, 0.0)
 
 
 def _normalised(message: Float[Tensor, "B P C"]) -> Float[Tensor, "B P C"]:
-    return message - _finite(log_sum_exp(message, (2,)))[..., None]
+    return message - _finite_or_zero(log_sum_exp(message, (2,)))[..., None]
 
 
 @cache

@@ -74,7 +74,7 @@ def solve(
     """
     game = _Game.of(energy, scene, parameters, step_size, damping, exact, threads)
     controls = torch.where(scene.agent_mask[:, None, :, None, None], parameters.initial_controls, 0.0)
-    status = torch.where(game.finite, Status.SOLVED, Status.STOPPED)
+    status = torch.where(game.finite_inputs, Status.SOLVED, Status.STOPPED)
     iterates, initial_energy = [controls], None
     for _ in range(steps):
         call = game.call(controls, 1)
@@ -182,15 +182,17 @@ class _Game:
         return [of[name] for of, some in zip((own, pair, margins), names, strict=True) for name in some]
 
     @cached_property
-    def finite(self) -> Bool[Tensor, "B M"]:
+    def finite_inputs(self) -> Bool[Tensor, "B M"]:
         """Mask of the games whose inputs are finite."""
-        return self.custom.finite(self.scene, self.parameters)
+        return self.custom.finite_inputs(self.scene, self.parameters)
 
     @cached_property
     def _stopping(self) -> Float[Tensor, "B M *agents"]:
         """The damping, with NaN where inputs are not finite: it stops a game, of whose inputs the kernel knows only the
         residuals."""
-        return torch.where(self.finite if self.damping.dim() == 2 else self.finite[..., None], self.damping, torch.nan)
+        return torch.where(
+            self.finite_inputs if self.damping.dim() == 2 else self.finite_inputs[..., None], self.damping, torch.nan
+        )
 
     def call(self, controls: Float[Tensor, "B M N K 2"], steps: int) -> compiled.Call:
         """A call of the kernel that takes one step from ``controls``, or none, which evaluates them."""

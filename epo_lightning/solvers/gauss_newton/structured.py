@@ -81,7 +81,7 @@ def solve(
     split = readable(controls) if split is None else split
     game = Game(energy, scene, parameters, step_size, damping.detach().to(controls.dtype).flatten(0, 1), split, exact)
     tensors = game.tensors()
-    status = torch.where(game.finite, Status.SOLVED, Status.STOPPED)
+    status = torch.where(game.finite_inputs, Status.SOLVED, Status.STOPPED)
     iterates = [controls]
     initial_energy = None
     for _ in range(steps):
@@ -120,9 +120,9 @@ class Game:
     exact: bool = False
 
     @cached_property
-    def finite(self) -> Bool[Tensor, "B M"]:
-        """Mask of the games with finite inputs (:meth:`~epo_lightning.game.feature_energy.FeatureEnergy.finite`)."""
-        return self.energy.finite(self.scene, self.parameters)
+    def finite_inputs(self) -> Bool[Tensor, "B M"]:
+        """Mask of the games with finite inputs (:meth:`~epo_lightning.game.feature_energy.FeatureEnergy.finite_inputs`)."""
+        return self.energy.finite_inputs(self.scene, self.parameters)
 
     def tensors(self) -> list[Tensor]:
         """The tensors of a game that have a gradient: weights, margins and targets."""
@@ -179,7 +179,7 @@ class _Step(torch.autograd.Function):
         step = factorised.solve(-model.gradient).transpose(-1, -2).reshape(controls.shape)
         status = factorised.status.view(controls.shape[:2])
         moved = controls + game.step_size * step
-        solved = game.finite & (status != Status.STOPPED) & moved.flatten(2).isfinite().all(-1)
+        solved = game.finite_inputs & (status != Status.STOPPED) & moved.flatten(2).isfinite().all(-1)
         accepted = solved[..., None, None, None]
         status = torch.where(solved, status, Status.STOPPED)
         value = model.value.view(controls.shape[:2])

@@ -50,7 +50,7 @@ def largest(values: Float[Tensor, "B M *some"]) -> Float[Tensor, "B M"]:
     return flat.amax(-1) if flat.shape[-1] else flat.sum(-1)
 
 
-def finite(value: Float[Tensor, "B M"], slope: Float[Tensor, "B M N K 2"]) -> Bool[Tensor, "B M"]:
+def both_finite(value: Float[Tensor, "B M"], slope: Float[Tensor, "B M N K 2"]) -> Bool[Tensor, "B M"]:
     """Mask of the samples with finite energy and gradient."""
     return value.isfinite() & slope.flatten(2).isfinite().all(-1)
 

@@ -172,7 +172,7 @@ def _evaluate(
 ) -> tuple[Float[Tensor, "B M"], Float[Tensor, "B M N K 2"], Bool[Tensor, "B M"]]:
     """The energy, its gradient, and a mask of the samples in ``going`` where both are finite."""
     value, slope = gradient(energy, scene, parameters, controls)
-    going = going & descent.finite(value, slope)
+    going = going & descent.both_finite(value, slope)
     if torch.is_grad_enabled() and not going.all():
 
         def again(*game: Any) -> tuple[Tensor, Tensor]:

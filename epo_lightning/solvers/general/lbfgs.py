@@ -65,7 +65,7 @@ class LBFGS(Minimiser):
         if controls.numel() == 0:
             return descent.nothing(controls)
         value, slope = gradient(energy, scene, parameters, controls)
-        initial, finite = value, descent.finite(value, slope)
+        initial, finite = value, descent.both_finite(value, slope)
         status = descent.first_status(finite)
         done = ~finite | (descent.largest(slope) <= self.tolerance)
         shape = *controls.shape[:2], self.history, slope[0, 0].numel()
@@ -78,7 +78,7 @@ class LBFGS(Minimiser):
             trial = gradient(energy, scene, parameters, there)
             promised = length * _dot(slope.flatten(2), direction.flatten(2))
             better = (trial[0] <= value + _DECREASE * promised) | descent.level(value, slope, *trial)
-            better = ~done & descent.finite(*trial) & better
+            better = ~done & descent.both_finite(*trial) & better
 
             move, change = (there - controls).flatten(2), (trial[1] - slope).flatten(2)
             curved = better & (_dot(move, change) > _CURVATURE * move.norm(dim=-1) * change.norm(dim=-1))

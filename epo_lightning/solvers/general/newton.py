@@ -60,7 +60,7 @@ class Newton(Minimiser):
         if controls.numel() == 0:
             return descent.nothing(controls)
         value, slope = gradient(energy, scene, parameters, controls)
-        finite = descent.finite(value, slope)
+        finite = descent.both_finite(value, slope)
         done = ~finite | (descent.largest(slope) <= self.tolerance)
         damping = torch.full_like(value, _FIRST_DAMPING)
         now = _Iterate(controls, value, slope, damping, descent.first_status(finite), done)
@@ -91,7 +91,7 @@ class Newton(Minimiser):
             there = torch.where(descent.wide(open_), controls + descent.wide(length) * move, controls)
             trial = gradient(energy, scene, parameters, there)
             better = (trial[0] < value) | descent.level(value, slope, *trial)
-            better = open_ & definite & descent.finite(*trial) & better
+            better = open_ & definite & descent.both_finite(*trial) & better
             promised = -(slope * move).flatten(2).sum(-1)
             whole = length == 1.0
             near = whole & (damping <= _FIRST_DAMPING) & (descent.largest(move) <= self.tolerance)
