@@ -12,41 +12,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from metrics.slow_interaction import interact
 
+from data.recorded.window_scenes import crowd, scenes_of, tables
 from epo_lightning.data.errors import RecordingError
 from epo_lightning.data.recorded.clock import TOO_SHORT
 from epo_lightning.data.recorded.lanes import lane_changes
 from epo_lightning.data.recorded.scenes import RecordedScenes
-from epo_lightning.data.recorded.tables import SceneTables, joined
+from epo_lightning.data.recorded.tables import joined
 from epo_lightning.data.recorded.windows import AT_ENDS, MOMENTS, WindowConfig, extract
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import KINDS
 
 from .roads import FOUR, WIDTH, curve, recording
-
-
-def tables(scenes: SceneTables) -> dict[str, torch.Tensor]:
-    return {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in scenes.columns().items()}
-
-
-def scenes_of(of, config=WindowConfig(), frame="fixed"):  # noqa: B008 - frozen
-    found, _ = extract(of, config)
-    data = RecordedScenes(tables(found), config.dt, frame, [of.name])
-    return data[torch.arange(len(data))], data
-
-
-def crowd(seed: int, count: int = 9):
-    """Vehicles all over the road, some of which change lane."""
-    random = np.random.default_rng(seed)
-    return [
-        (
-            int(number),
-            random.uniform(0, 250),
-            int(random.integers(0, 2)),
-            random.uniform(15, 35),
-            random.uniform(0, 8) if random.uniform() < 0.3 else None,
-        )
-        for number in random.permutation(100)[:count]
-    ]
 
 
 def obvious(of, config: WindowConfig) -> set[tuple[int, frozenset[int]]]:
@@ -162,72 +138,6 @@ def test_goals_lie_on_the_lanes_that_an_agent_may_take():
             candidates = goals[i][line == number]
             height = np.interp(candidates[:, 0], lines[number, :, 0], lines[number, :, 1])
             np.testing.assert_allclose(height, candidates[:, 1], atol=1e-3)
-
-
-@given(st.integers(0, 10_000), st.floats(-3.1, 3.1))
-@settings(max_examples=15)
-def test_moving_the_world_moves_the_frame_and_nothing_else(seed, turn):
-    vehicles = crowd(seed, 6)
-    config = WindowConfig(radius=None, lane_change=False)
-    here, _ = scenes_of(recording(curve(900.0), vehicles), config, "aligned")
-    there, _ = scenes_of(recording(curve(900.0, turn, (-7000.0, 2500.0)), vehicles), config, "aligned")
-    for name in ("history", "future", "goal_candidates", "references", "reference_speed", "lanes"):
-        one, other = getattr(here, name), getattr(there, name)
-        torch.testing.assert_close(one, other, rtol=0, atol=5e-4)
-    moved, _ = scenes_of(recording(curve(900.0, 0.0, (-7000.0, 2500.0)), vehicles), config)
-    still, _ = scenes_of(recording(curve(900.0), vehicles), config)
-    for name in ("history", "future", "goal_candidates", "references", "lanes"):
-        torch.testing.assert_close(getattr(moved, name), getattr(still, name), rtol=0, atol=5e-4)
-
-
-def test_an_aligned_scene_is_the_fixed_one_in_its_own_frame():
-    of = recording(curve(700.0, 0.4, (4000.0, -900.0)))
-    (fixed, _), (aligned, _) = scenes_of(of), scenes_of(of, frame="aligned")
-    angle = aligned.frame[:, 2]
-    assert angle.min() > 0.3
-    cosine, sine = angle.cos(), angle.sin()
-    rotation = torch.stack((torch.stack((cosine, -sine), -1), torch.stack((sine, cosine), -1)), -2)
-    for name in ("history", "future", "goal_candidates", "references", "lanes"):
-        here, there = (getattr(scene, name).double() for scene in (aligned, fixed))
-        for ends in (slice(0, 2), slice(2, 4)) if name == "lanes" else (slice(0, 2),):
-            turned = torch.einsum("bij,b...j->b...i", rotation, here[..., ends])
-            torch.testing.assert_close(turned, there[..., ends], rtol=0, atol=2e-3)
-        if name in ("history", "future"):
-            torch.testing.assert_close(here[..., 2] + angle[:, None, None], there[..., 2], rtol=0, atol=1e-5)
-            assert torch.equal(here[..., 3], there[..., 3])
-
-
-def test_agents_that_head_against_each_other_are_aligned_with_the_focal_one():
-    of = recording(vehicles=((1, 30.0, 0, 20.0, None), (2, 60.0, 1, 20.0, None)))
-    away = of.tracks.agent == 1
-    tracks = dataclasses.replace(
-        of.tracks,
-        heading=of.tracks.heading + np.where(away, np.pi, 0.0),
-        velocity=of.tracks.velocity * np.where(away, -1.0, 1.0)[:, None],
-    )
-    config = WindowConfig(agents=2, least_agents=2, lane_change=False)
-    for turn in (0.0, 1e-6, 1.0):
-        cosine, sine = np.cos(turn), np.sin(turn)
-        rotation = np.array([[cosine, -sine], [sine, cosine]])
-        turned = dataclasses.replace(
-            tracks,
-            position=tracks.position @ rotation.T,
-            heading=tracks.heading + turn,
-            velocity=tracks.velocity @ rotation.T,
-        )
-        scene, _ = scenes_of(dataclasses.replace(of, tracks=turned, lanes=None), config, "aligned")
-        torch.testing.assert_close(scene.current[:, 0, 2], torch.zeros(len(scene.history)), rtol=0, atol=1e-5)
-
-
-def test_headings_begin_within_half_a_turn_and_go_on_without_a_jump():
-    of = recording(curve(100.0, 2.5), vehicles=((1, 5.0, 0, 25.0, None),))
-    scene, _ = scenes_of(of, WindowConfig(agents=1, least_agents=1, lane_change=False))
-    current = scene.current[:, 0, 2]
-    assert current.min() < -1.0, "the recording turns beyond half a turn"
-    assert current.max() > 2.9
-    assert (current.abs() <= np.pi + 1e-5).all()
-    way = torch.cat((scene.history, scene.future), 2)[:, 0, :, 2]
-    assert (way.diff(dim=1) - 25.0 * 0.2 / 100.0).abs().max() < 0.01
 
 
 def test_tracks_may_begin_and_end_at_any_time():
