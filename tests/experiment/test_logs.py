@@ -1,53 +1,36 @@
-"""Logs: dashboards get the values of the CSV file, and cannot disturb a run."""
+"""Logs: dashboards get the values of the CSV file."""
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import subprocess
 import sys
-import threading
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
-import torch
 from experiment import tiny
 from experiment.conftest import TINY, Epo
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
+from experiment.dashboard_runs import ROW, events, facts, hyperparameters, in_file, no_account, stopped  # noqa: F401 - fixtures
 
 from epo_lightning.experiment import logs
-from epo_lightning.experiment.callbacks import RandomStates
-from epo_lightning.experiment.config.settings import MLflowSettings, Settings, TensorBoardSettings
-from epo_lightning.experiment.dashboards import aside
-from epo_lightning.experiment.dashboards.aside import Aside
-from epo_lightning.experiment.dashboards.base import Dashboard, Ending, Facts, Row
+from epo_lightning.experiment.config.settings import MLflowSettings, Settings
 from epo_lightning.experiment.dashboards.mlflow import MLflow
-from epo_lightning.experiment.dashboards.tensorboard import TensorBoard
 from epo_lightning.experiment.dashboards.wandb import has_key
 from epo_lightning.run_folder import RunFolder, discover
 from epo_lightning.schema import read
 
-ROW = "experiment=rpi/v_lstm_sc"
 STEP = "trainer/global_step"
 
 
 WANDB = ("logger=[wandb]", "logger.wandb.patience=120")
+
+
 MLFLOW = ("logger=[mlflow]", "logger.mlflow.patience=120")
 """Dashboards that a busy machine does not switch off."""
-
-
-@pytest.fixture(autouse=True)
-def no_account(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Environment without the user's keys, servers and databases."""
-    for name in ("WANDB_API_KEY", "WANDB_BASE_URL", "WANDB_MODE", "MLFLOW_TRACKING_URI"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv("NETRC", str(tmp_path / "netrc"))
 
 
 def test_empty_sections_are_parameters_of_a_run_like_others() -> None:
@@ -60,34 +43,6 @@ def test_empty_sections_are_parameters_of_a_run_like_others() -> None:
         "energy.margins": {},
         "energy.bounds.vel": [0.0, 2.0],
     }
-
-
-@pytest.fixture
-def stopped(epo: Epo, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Train four epochs and fail at the beginning of the third."""
-
-    def train(*words: str) -> None:
-        starts: list[int] = []
-        original = RandomStates.on_train_epoch_start
-
-        def stop(self: RandomStates, trainer: Any, module: Any) -> None:
-            starts.append(1)
-            if len(starts) == 3:
-                raise RuntimeError("power failure")
-            original(self, trainer, module)
-
-        with monkeypatch.context() as patch:
-            patch.setattr(RandomStates, "on_train_epoch_start", stop)
-            with pytest.raises(RuntimeError, match="power failure"):
-                epo("train", ROW, *TINY, "trainer.max_epochs=4", *words)
-
-    return train
-
-
-def in_file(run: str, name: str) -> list[tuple[int, float]]:
-    """Contents of metrics.csv."""
-    with Path(run, "logs", "metrics.csv").open(newline="") as file:
-        return [(int(row["step"]), float(row[name])) for row in csv.DictReader(file) if row[name]]
 
 
 def best_in_file(run: str) -> float:
@@ -115,16 +70,6 @@ def wandb_history(run: str) -> list[tuple[int, float]]:
             if "val/minSADE" in row:
                 points.append((int(row[STEP]), float(row["val/minSADE"])))
     return points
-
-
-def events(run: str) -> EventAccumulator:
-    found = EventAccumulator(str(Path(run, "logs")), size_guidance={"scalars": 0})
-    return found.Reload()
-
-
-def hyperparameters(run: str) -> Any:
-    content = events(run).SummaryMetadata("_hparams_/session_start_info").plugin_data.content
-    return HParamsPluginData.FromString(content).session_start_info.hparams
 
 
 # CSV
@@ -169,7 +114,7 @@ def test_tensorboard_shows_the_values_of_the_csv_file(epo: Epo, logger: str) -> 
     assert shown["forecaster.name"].string_value == "scene_consistent"
 
 
-def test_tensorboard_has_no_point_twice_after_a_stop(epo: Epo, stopped: Callable[..., None]) -> None:
+def test_tensorboard_has_no_point_twice_after_a_stop(epo: Epo, stopped: Callable[..., None]) -> None:  # noqa: F811
     stopped("run_dir=run", "logger=[tensorboard]")
     Path("run/logs/events.out.tfevents.0.lost").write_bytes(b"")  # from a process before that
     assert epo("train", "resume=run") == 0
@@ -220,7 +165,7 @@ def group_of(run: str) -> tuple[str, str]:
 
 
 @pytest.mark.slow
-def test_a_stopped_run_continues_in_the_same_wandb_run(epo: Epo, stopped: Callable[..., None]) -> None:
+def test_a_stopped_run_continues_in_the_same_wandb_run(epo: Epo, stopped: Callable[..., None]) -> None:  # noqa: F811
     stopped("run_dir=run", *WANDB)
     assert [folder["exit_code"] for folder in wandb_folders("run")] == [1]
     assert epo("train", "resume=run") == 0
@@ -263,7 +208,7 @@ def client(database: str = "runs/mlflow.db") -> Any:
     return MlflowClient(f"sqlite:///{Path(database).resolve()}")
 
 
-def test_mlflow_keeps_name_parameters_tags_and_scores_through_a_stop(epo: Epo, stopped: Callable[..., None]) -> None:
+def test_mlflow_keeps_name_parameters_tags_and_scores_through_a_stop(epo: Epo, stopped: Callable[..., None]) -> None:  # noqa: F811
     pytest.importorskip("mlflow")
     stopped("run_dir=runs/one", *MLFLOW)
     there = client()
@@ -325,167 +270,3 @@ def test_several_processes_share_one_database(tmp_path: Path) -> None:
     runs = there.search_runs([there.get_experiment_by_name("epo_lightning").experiment_id])
     assert sorted(run.info.run_name for run in runs) == [f"V-LSTM + SC (seed {seed})" for seed in range(4)]
     assert all(run.data.metrics["best/minSADE"] > 0 and run.info.status == "FINISHED" for run in runs)
-
-
-# All of them
-
-
-def test_dashboards_change_nothing_in_a_run(epo: Epo) -> None:
-    assert epo("train", ROW, *TINY, "run_dir=alone") == 0
-    assert epo("train", ROW, *TINY, "run_dir=watched", "logger=[csv,tensorboard,wandb,mlflow]") == 0
-    one, other = (torch.load(f"{run}/checkpoints/last.ckpt", weights_only=True) for run in ("alone", "watched"))
-    assert all(torch.equal(value, other["state_dict"][key]) for key, value in one["state_dict"].items())
-    assert Path("alone/logs/metrics.csv").read_text() == Path("watched/logs/metrics.csv").read_text()
-
-
-class Bad(Dashboard):
-    """Fails or hangs at one of its methods."""
-
-    label = "Bad"
-    where, how = "", ""
-    release = threading.Event()
-
-    def __init__(self, facts: Facts, settings: object = None) -> None:
-        super().__init__(facts)
-        self.told: list[Row] = []
-        self.ended: Ending | None = None
-
-    def _here(self, where: str) -> None:
-        if where != self.where:
-            return
-        if self.how == "hangs":
-            self.release.wait()
-        elif self.how == "exits":
-            sys.exit(3)
-        else:
-            raise OSError(28, "No space left on device")
-
-    def open(self) -> None:
-        self._here("open")
-
-    def log(self, rows: Sequence[Row]) -> None:
-        self._here("log")
-        self.told += rows
-
-    def close(self, ending: Ending) -> None:
-        self._here("close")
-        self.ended = ending
-
-
-@pytest.fixture
-def bad(monkeypatch: pytest.MonkeyPatch) -> Iterator[type[Bad]]:
-    """TensorBoard replaced by a dashboard that does not work."""
-    monkeypatch.setattr(Bad, "release", threading.Event())
-    monkeypatch.setattr(logs, "TensorBoard", Bad)
-    yield Bad
-    Bad.release.set()
-
-
-@pytest.mark.parametrize("how", ["raises", "hangs", "exits"])
-@pytest.mark.parametrize("where", ["open", "log", "close"])
-def test_a_failing_dashboard_does_not_stop_the_run(
-    epo: Epo, bad: type[Bad], where: str, how: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(bad, "where", where)
-    monkeypatch.setattr(bad, "how", how)
-    words = ("logger=[tensorboard]", "logger.tensorboard.patience=0.5")
-    assert epo("train", ROW, *TINY, "run_dir=run", *words) == 0
-    assert RunFolder(Path("run")).finished
-    assert len(in_file("run", "val/minSADE")) == 2
-    warnings = [line for line in capsys.readouterr().err.splitlines() if line.startswith("Bad")]
-    assert len(warnings) == 1
-    assert "switched off for this run" in warnings[0]
-    assert {"raises": "No space left", "hangs": "did not answer for 0.5 s", "exits": "SystemExit"}[how] in warnings[0]
-    assert "epo evaluate run=run" in warnings[0]
-
-
-def test_the_runs_of_a_sweep_are_a_group(epo: Epo, bad: type[Bad]) -> None:
-    assert epo("train", ROW, *TINY, "run_dir=run", "logger=[tensorboard]") == 0
-    run = RunFolder.open("run")
-    config = run.config() | {"sweep": "runs/sweeps/ours"}
-    run.begin(config, run.record)
-    for sweep in ("ours", "another that continues it"):
-        now = config | {"sweep": f"runs/sweeps/{sweep}"}
-        with logs.open_logs(read(Settings, now), now, run) as (_, logger):
-            told = logger.dashboard.facts
-        assert (told.group, told.name) == ("ours", "V-LSTM + SC (seed 0)")
-    assert told.parameters()["optimizer.lr"] == 1e-3
-
-
-def facts(folder: Path) -> Facts:
-    return Facts("id", "name", None, {"a": {"b": 1, "c": [1, 2]}}, {}, folder)
-
-
-def test_a_dashboard_that_cannot_keep_up_is_dropped(
-    bad: type[Bad], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(bad, "where", "open")
-    monkeypatch.setattr(bad, "how", "hangs")
-    monkeypatch.setattr(aside, "BEHIND", 50)
-    logger = Aside(Bad(facts(tmp_path)), patience=60.0)
-    began = time.monotonic()
-    for step in range(1000):
-        logger.log_metrics({"a": 1.0}, step)
-    logger.close(Ending())
-    assert time.monotonic() - began < 5
-    assert capsys.readouterr().err.count("50 rows behind") == 1
-
-
-def test_a_slow_dashboard_gets_every_row_in_order_and_costs_the_run_nothing(tmp_path: Path) -> None:
-    class Slow(Bad):
-        def log(self, rows: Sequence[Row]) -> None:
-            time.sleep(0.2)
-            super().log(rows)
-
-    dashboard = Slow(facts(tmp_path))
-    logger = Aside(dashboard, patience=30.0, past=[(0, {"a": 0.0})])
-    began = time.monotonic()
-    for step in range(1, 2000):
-        logger.log_metrics({"a": float(step)}, step)
-    assert time.monotonic() - began < 1.5
-    logger.close(Ending(summary={"best/a": 1.0}))
-    assert [step for step, _ in dashboard.told] == list(range(2000))
-    assert dashboard.ended == Ending(summary={"best/a": 1.0})
-    assert logger.off is None
-
-
-def test_an_evaluation_sends_missed_values_to_the_dashboard_again(
-    epo: Epo, bad: type[Bad], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with monkeypatch.context() as patch:
-        patch.setattr(bad, "where", "open")
-        assert epo("train", ROW, *TINY, "run_dir=run", "logger=[tensorboard]") == 0
-    monkeypatch.setattr(logs, "TensorBoard", TensorBoard)
-    assert epo("evaluate", "run=run") == 0
-    assert len(events("run").Scalars("val/minSADE")) == 2
-
-
-@pytest.mark.skipif(not Path("/proc/mounts").is_file(), reason="mounts are made as on Linux")
-def test_a_full_disk_under_wandb_does_not_stop_the_run(
-    epo: Epo, stopped: Callable[..., None], capfd: pytest.CaptureFixture[str]
-) -> None:
-    stopped("run_dir=run", "logger=[csv]")
-    config = Path("run/config.yaml")
-    config.write_text(config.read_text().replace("logger:", "logger:\n  wandb: {mode: offline, patience: 15}\n ", 1))
-    folder = Path("run/logs/wandb")
-    folder.mkdir()
-    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=16k", "tmpfs", folder], capture_output=True)
-    if mounted.returncode:
-        pytest.skip("mounting a tiny disk needs root")
-    try:
-        assert epo("train", "resume=run") == 0
-        left = subprocess.run(["df", "--output=avail", folder], capture_output=True, text=True, check=True).stdout
-        assert left.split()[-1] == "0", "the disk was to be full"
-    finally:
-        subprocess.run(["umount", "--lazy", folder], check=True)
-    assert RunFolder(Path("run")).finished
-    assert len(in_file("run", "val/minSADE")) == 4
-
-
-def test_hyperparameters_are_plain_values(tmp_path: Path) -> None:
-    (tmp_path / "logs").mkdir()
-    board = TensorBoard(facts(tmp_path), TensorBoardSettings())
-    board.open()
-    board.close(Ending(summary={"best/a": 2.0}))
-    shown = hyperparameters(str(tmp_path))
-    assert (shown["a.b"].number_value, shown["a.c"].string_value) == (1.0, "[1, 2]")
