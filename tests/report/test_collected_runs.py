@@ -178,7 +178,9 @@ def test_damaged_errors_of_costs_are_one_message(tmp_path: Path, truth: Any) -> 
     run = make_run(tmp_path / "sc", "SC", "scene_consistent", scores(1.0))
     content = json.loads((run.path / "metrics.json").read_text())
     write_json(run.path / "metrics.json", {**content, "truth": truth})
-    with pytest.raises(ConfigError, match=r"metrics.json: truth must be numbers by name; epo evaluate"):
+    with pytest.raises(
+        ConfigError, match=r"metrics.json is damaged: its entry truth must be numbers by name, not .*; epo evaluate"
+    ):
         collect(tmp_path)
 
 
