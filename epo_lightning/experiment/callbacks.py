@@ -87,16 +87,7 @@ class NextEpoch(Callback):
 
 
 class ModelCheckpoint(of_lightning.ModelCheckpoint):
-    """Lightning's ModelCheckpoint, whose stored paths follow a run folder that was moved.
-
-    Before it stores the end of an epoch, it has the epoch's row logged, which Lightning logs only afterwards: a run that is
-    stopped in between would continue after this epoch and lack its row. A row without a checkpoint is written again.
-    """
-
-    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if self._save_on_train_epoch_end:
-            _log_epoch(trainer)
-        super().on_train_epoch_end(trainer, pl_module)
+    """Lightning's ModelCheckpoint, whose stored paths follow a run folder that was moved."""
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         _require_logged(self.monitor, trainer)
@@ -123,17 +114,6 @@ class EarlyStopping(of_lightning.EarlyStopping):
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         trainer.should_stop = trainer.should_stop or self.wait_count >= self.patience
-
-
-def _log_epoch(trainer: Trainer) -> None:
-    """Log the metrics of an epoch as Lightning does at its end; it then finds none that are left to be logged."""
-    loop = trainer.fit_loop.epoch_loop
-    _ = trainer.callback_metrics  # Lightning collects them when they are read, and here they are read for the last time
-    loop._batches_that_stepped -= 1  # the row of an epoch has the step of its last batch
-    try:
-        trainer._logger_connector.update_train_epoch_metrics()
-    finally:
-        loop._batches_that_stepped += 1
 
 
 def _require_logged(monitor: str | None, trainer: Trainer) -> None:

@@ -9,12 +9,10 @@ import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from experiment.conftest import TINY, Epo
-from lightning.pytorch import Trainer
 
 from epo_lightning.experiment import train as training
 from epo_lightning.experiment.callbacks import RandomStates
@@ -77,29 +75,6 @@ def test_a_run_that_was_moved_keeps_its_best_epoch(epo: Epo) -> None:
     assert epo("train", "resume=elsewhere/moved") == 0
     assert same("whole", "elsewhere/moved")
     assert not Path("parts").exists()
-
-
-@pytest.mark.parametrize("stored", [False, True])
-def test_a_run_that_stops_before_or_after_its_checkpoint_of_an_epoch_logs_every_epoch_once(
-    epo: Epo, stored: bool
-) -> None:
-    assert epo(*WORSENING, "run_dir=whole") == 0
-    store, begun = Trainer.save_checkpoint, []
-
-    def stop(self: Trainer, file: str, *arguments: Any, **options: Any) -> None:
-        begun.extend(["last"] if Path(file).stem == "last" else [])
-        if stored or len(begun) < 2:
-            store(self, file, *arguments, **options)
-        if len(begun) == 2:
-            raise RuntimeError("power failure")
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Trainer, "save_checkpoint", stop)
-        with pytest.raises(RuntimeError, match="power failure"):
-            epo(*WORSENING, "run_dir=parts")
-    assert torch.load("parts/checkpoints/last.ckpt", weights_only=True)["epoch"] == (1 if stored else 0)
-    assert epo("train", "resume=parts") == 0
-    assert same("whole", "parts")
 
 
 def test_a_run_that_had_stopped_early_makes_no_further_step(epo: Epo) -> None:
