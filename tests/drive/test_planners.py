@@ -8,10 +8,19 @@ import pytest
 import torch
 
 import epo_lightning
-from epo_lightning.drive.planners import BRAKING, ForecastPlanner, GamePlanner, Plan, ResponsePlanner, shifted
+from epo_lightning.drive.planners import (
+    BRAKING,
+    ForecastPlanner,
+    GamePlanner,
+    Plan,
+    ResponsePlanner,
+    constant,
+    shifted,
+)
 from epo_lightning.drive.rpi import RPIWorld
 from epo_lightning.forecast import JointForecast
 from epo_lightning.forecasters.base import Forecaster
+from epo_lightning.frames import in_world
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import SPEED, Scene
 
@@ -24,6 +33,17 @@ def world() -> RPIWorld:
 @pytest.fixture(scope="module")
 def epo() -> Forecaster:
     return epo_lightning.load("rpi/v_lstm_epo")
+
+
+class Given(Forecaster):
+    """A forecaster that returns a given forecast."""
+
+    def __init__(self, like: Forecaster, forecast: JointForecast) -> None:
+        super().__init__(like.task, like.optimizer)
+        self.given = forecast
+
+    def forward(self, scene: Scene) -> JointForecast:
+        return self.given
 
 
 def likely(forecast: JointForecast) -> torch.Tensor:
@@ -49,6 +69,12 @@ def test_the_nearest_mode_is_kept(world: RPIWorld, epo: Forecaster) -> None:
     kept = ForecastPlanner(epo, keep=True)(scene, previous)
     torch.testing.assert_close(kept.states, states)
     torch.testing.assert_close(ForecastPlanner(epo)(scene, previous).states, likely(forecast))
+    lost = forecast.states.clone()
+    lost[rows, 1 - unlikely] = torch.nan
+    broken = Given(epo, dataclasses.replace(forecast, states=lost))
+    found = ForecastPlanner(broken, keep=True)(scene, previous)
+    assert found.found.all(), "no mode that is not finite is the nearest one"
+    torch.testing.assert_close(found.states, states)
 
 
 def test_pair_terms_and_warm_starts_change_the_solved_game(world: RPIWorld, epo: Forecaster) -> None:
@@ -77,13 +103,9 @@ def test_options_of_a_game_need_a_game() -> None:
 
 
 def test_forecasts_without_controls_are_tracked(world: RPIWorld, epo: Forecaster) -> None:
-    class Silent(Forecaster):
-        def forward(self, scene: Scene) -> JointForecast:
-            forecast = epo.predict(scene)
-            return JointForecast(forecast.states, forecast.probabilities)
-
     scene = world.observe()
-    plan = ForecastPlanner(Silent(epo.task, epo.optimizer))(scene, None)
+    forecast = epo.predict(scene)
+    plan = ForecastPlanner(Given(epo, JointForecast(forecast.states, forecast.probabilities)))(scene, None)
     torch.testing.assert_close(plan.controls, ForecastPlanner(epo)(scene, None).controls, rtol=0, atol=1e-3)
 
 
@@ -106,6 +128,26 @@ def test_a_response_is_the_best_one_to_the_forecast(world: RPIWorld, epo: Foreca
             assert bool((world.energy(scene, game, plan.joint + noise) > cost).all())
 
 
+def test_others_without_a_finite_forecast_are_expected_to_go_straight_on(world: RPIWorld, epo: Forecaster) -> None:
+    scene = world.observe()
+    forecast = epo.predict(scene)
+    assert forecast.controls is not None
+    broken = dataclasses.replace(forecast, controls=torch.full_like(forecast.controls, torch.nan))
+    known, unknown = (
+        ResponsePlanner(world.energy, world.game, forecaster)(scene, None) for forecaster in (None, Given(epo, broken))
+    )
+    torch.testing.assert_close(unknown.states, known.states)
+
+
+def test_a_plan_is_found_if_every_best_response_is(world: RPIWorld, monkeypatch: pytest.MonkeyPatch) -> None:
+    for lacking in (0, 1):
+        planner = GamePlanner(world.energy, world.game, rounds=1)
+        monkeypatch.setattr(
+            planner, "_descend", lambda *given, no=lacking: (given[2], torch.full((3,), given[3] != no))
+        )
+        assert not planner(world.observe(), None).found.any()
+
+
 def test_iterated_best_responses_meet_the_joint_minimum(world: RPIWorld) -> None:
     scene = world.observe()
     joint, iterated = (GamePlanner(world.energy, world.game, rounds)(scene, None) for rounds in (None, 20))
@@ -121,6 +163,9 @@ def test_a_step_without_a_plan_follows_the_last_one() -> None:
         torch.full((2, 5, 2), torch.nan), torch.full((2, 2, 5, 4), torch.nan), torch.tensor([False, False]), None
     )
     plan = broken.or_else(last, scene)
+    again = dataclasses.replace(broken, joint=torch.full((2, 1, 2, 5, 2), torch.nan)).or_else(last, scene)
+    assert again.joint is not None
+    assert again.joint.isfinite().all(), "the next step has a warm start"
     torch.testing.assert_close(plan.controls, shifted(controls, 5))
     torch.testing.assert_close(plan.states[:, :, :-1], last.states[:, :, 1:])
     assert not plan.found.any()
@@ -138,3 +183,18 @@ def test_shifted_strategies_are_padded_or_cut() -> None:
     torch.testing.assert_close(shifted(controls, 3), controls[1:])
     torch.testing.assert_close(shifted(controls, 2), controls[1:3])
     torch.testing.assert_close(shifted(controls, 5), torch.cat((controls[1:], torch.zeros(2, 2))))
+
+
+def test_a_plan_keeps_its_place_in_the_world_when_the_frame_of_scenes_moves() -> None:
+    frames = torch.tensor([[[100.0, -50.0, 0.5]], [[103.0, -49.0, 0.9]]], dtype=torch.double)
+    before, now = (Scene(torch.zeros(1, 2, 1, 4), dt=0.1, frame=frame) for frame in frames)
+    states = torch.randn(1, 2, 5, 4, dtype=torch.double)
+    plan = Plan(torch.zeros(1, 5, 2), states, torch.ones(1, dtype=torch.bool)).seen_from(before, now)
+    torch.testing.assert_close(in_world(plan.states, frames[1]), in_world(states, frames[0]))
+
+
+def test_agents_brake_until_they_stand_forwards_and_backwards() -> None:
+    speed = torch.tensor([1.0, -1.0, 0.0])
+    rate = constant(speed, -2.0, 10, 0.1)[..., 0]
+    torch.testing.assert_close(rate[:, :5], torch.tensor([[-2.0], [2.0], [0.0]]).expand(-1, 5))
+    torch.testing.assert_close(rate[:, 5:], torch.zeros(3, 5), rtol=0, atol=1e-6)

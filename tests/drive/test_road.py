@@ -10,13 +10,14 @@ import torch
 
 from epo_lightning.data.recorded.scenes import RecordedScenes
 from epo_lightning.data.recorded.windows import WindowConfig, extract
-from epo_lightning.drive.planners import ResponsePlanner
+from epo_lightning.drive.planners import GamePlanner, Plan, ResponsePlanner
 from epo_lightning.drive.road_game import ENERGY, keep_going, road_game
 from epo_lightning.drive.road_scenes import RoadScenes
 from epo_lightning.drive.traffic import TrafficWorld
+from epo_lightning.drive.world import Search
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.registry import lookup
-from epo_lightning.scene import Scene
+from epo_lightning.scene import TURN_RATE, Scene, rotated
 
 RECORDINGS = Path(__file__).parents[1] / "fixtures" / "exid_sim"
 
@@ -78,6 +79,39 @@ def test_agents_that_keep_going_stay_on_their_lanes() -> None:
     )
 
 
+def bend(speed: float, towards: float) -> Scene:
+    """Two vehicles on a lane, 20 m before it turns to the left by a circle of 50 m, which ends after 85 m."""
+    way = torch.linspace(0.0, 115.0, 24, dtype=torch.double)
+    angle = ((way - 30.0) / 50.0).clamp_min(0.0)
+    line = torch.stack((way.clamp_max(30.0) + 50.0 * angle.sin(), 50.0 * (1.0 - angle.cos())), -1)
+    turn = torch.tensor(towards, dtype=torch.double)
+    place = rotated(torch.tensor([10.0, 0.0], dtype=torch.double), turn)
+    history = torch.tensor([[[[*place.tolist(), towards, speed]]] * 2], dtype=torch.double)
+    return Scene(
+        history=history,
+        dt=0.2,
+        references=rotated(line, turn).expand(1, 2, 3, -1, -1),
+        reference_speed=torch.full((1, 2), speed, dtype=torch.double),
+    )
+
+
+@pytest.mark.parametrize("towards", [0.0, 3.0])
+@pytest.mark.parametrize(("speed", "turned"), [(15.0, (70.0 - 30.0) / 50.0), (40.0, (112.5 - 30.0) / 50.0)])
+def test_agents_turn_by_as_much_as_their_lane_does_ahead(speed: float, turned: float, towards: float) -> None:
+    """In 4 s; a lane goes straight on from the middle of its last piece on. Headings may pass pi."""
+    rate = keep_going(bend(speed, towards), 20)[..., TURN_RATE]
+    torch.testing.assert_close(4.0 * rate, torch.full_like(rate, turned), rtol=0, atol=0.02)
+
+
+def test_controls_of_the_planned_vehicle_cost_in_themselves_and_those_of_others_where_they_differ() -> None:
+    scene = bend(15.0, 0.0)
+    usual = road_game(scene, torch.tensor([1]), 20).reference_controls
+    assert usual is not None
+    assert not usual[0, 0, 0].any()
+    assert torch.equal(usual[0, 0, 1], keep_going(scene, 20)[0, 1])
+    assert usual[0, 0, 1].any()
+
+
 def queue(gap: float) -> Scene:
     """A vehicle at 20 m/s on a straight lane, and one that stands ``gap`` metres ahead of it."""
     history = torch.tensor([[[[0.0, 0.0, 0.0, 20.0]], [[gap, 0.0, 0.0, 0.0]]]], dtype=torch.double)
@@ -106,3 +140,29 @@ def test_a_planned_vehicle_brakes_for_a_queue_and_changes_lanes_when_it_wants_to
     assert float(braked[1, :, 3].abs().max()) == 0.0, "who stands keeps standing"
     left = plan(queue(300.0), 0)
     assert float(left[0, -1, 1]) > 2.0
+
+
+def test_a_response_starts_at_the_last_plan_of_the_planned_vehicle_alone() -> None:
+    lines, joint = torch.tensor([1]), torch.zeros(1, 1, 2, 20, 2, dtype=torch.double)
+    joint[..., 0] = torch.linspace(-1.0, 0.0, 20)
+    previous = Plan(torch.zeros(1, 20, 2), torch.zeros(1, 2, 20, 4), torch.ones(1, dtype=torch.bool), joint)
+    planner = ResponsePlanner(ENERGY, lambda scene: road_game(scene, lines, 20), None, Search(steps=0))
+    plan = planner(queue(300.0), previous)
+    assert plan.joint is not None
+    torch.testing.assert_close(plan.controls[:, :-1], joint[:, 0, 0, 1:])
+    assert not plan.joint[:, 0, 1].any()
+
+
+def test_the_best_response_of_another_vehicle_does_not_move_the_planned_one() -> None:
+    """The planned vehicle brakes in a further start of its own search, not while it is held by a costly strategy."""
+    scene, lines = queue(15.0), torch.tensor([1])
+    found = []
+    for search in (TrafficWorld.search, Search(steps=TrafficWorld.search.steps)):
+        planner = GamePlanner(ENERGY, lambda scene: road_game(scene, lines, 20), 1, search)
+        game, start = planner._start(scene, None)
+        start[0, 0, 0, ::2, 0], start[0, 0, 0, 1::2, 0] = 4.0, -4.0
+        controls, fine = planner._descend(scene, game, start, 1)
+        assert fine.all()
+        found.append(controls)
+    torch.testing.assert_close(found[0], found[1])
+    assert found[0][0, 0, 1].any(), "it gives way to the planned vehicle behind it"
