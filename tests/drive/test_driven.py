@@ -41,6 +41,17 @@ def test_what_was_written_is_read_again_with_infinite_values(path: Path) -> None
     assert driven.measured("plays", ["a"])["a"]["distance"].tolist() == [torch.inf, 2.0, pytest.approx(0.1)]
 
 
+def test_measures_are_in_the_order_of_episodes_also_if_some_were_driven_again(path: Path) -> None:
+    """Planners are compared by differences of the same episodes."""
+    first, damaged, *rest = path.read_text().splitlines()
+    path.write_text("\n".join([first, damaged.replace("2.0", "3.0"), *rest, ""]))
+    driven = opened(path, [])
+    assert not driven.has("plays", "a", range(2))
+    driven.add("plays", "a", range(2), {"distance": torch.tensor([torch.inf, 2.0]), "cost": torch.ones(2)})
+    for record in (driven, opened(path, [])):
+        assert record.measured("plays", ["a"])["a"]["distance"].tolist() == [torch.inf, 2.0, pytest.approx(0.1)]
+
+
 @pytest.mark.parametrize(
     "change",
     [

@@ -92,6 +92,9 @@ def test_comfort_progress_and_deadlocks() -> None:
         standing.outcome.states[:, 0, :, 3] = 1.0
         standing.outcome.states[:, 0, :steps, 3] = 0.0
         assert values(standing)["deadlock"] == expected
+    over = meeting(1.0, speed=0.0)
+    over.outcome.agent_mask[:, :, 15:] = False
+    assert values(over)["deadlock"] == 0.0, "its last state is kept after the end, which is no time that it stands"
 
 
 def test_one_step_without_a_plan_counts() -> None:
@@ -108,6 +111,8 @@ def test_intervals() -> None:
     mean = estimate(draws)
     assert mean.high - mean.low == pytest.approx(2 * 1.96 * float(draws.std()) / 20, rel=0.1)
     assert estimate(draws) == mean, "intervals are the same in every run"
+    still = estimate(torch.zeros(20, dtype=torch.double))
+    assert (still.mean, still.low, still.high) == (0.0, 0.0, 0.0), "lengths that are all 0 are no rate"
 
 
 def test_differences_are_those_of_the_same_episodes() -> None:

@@ -31,3 +31,7 @@ def test_episodes_that_were_driven_before_take_no_time() -> None:
     driving.skip("a", 100)
     driving.drove("b", 50, 120.0)
     assert lines == ["plays    b: 50 of 100 episodes, 120 s; plays takes about 2 min more"]
+    begun = Progress("plays", 100, ["c"], lines.append)
+    begun.skip("c", 60)
+    begun.drove("c", 40, 10.0)
+    assert lines[1:] == ["plays    c: 100 of 100 episodes, 10 s"]
