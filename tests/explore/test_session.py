@@ -15,6 +15,7 @@ import epo_lightning
 from epo_lightning import pretrained
 from epo_lightning.explore.edit import Edit
 from epo_lightning.explore.session import Session
+from epo_lightning.metrics.forecast import equilibrium_values
 from epo_lightning.registry import ConfigError
 
 RUN, SCENE = "rpi/v_lstm_epo", 3
@@ -75,8 +76,10 @@ def test_agents_follow_a_goal_that_was_moved(session: Session) -> None:
     after = session.solve(Edit(scene=SCENE, goals={"0": [x, y + 3.0]}))
     assert after["modes"][0]["goals"][0] == [pytest.approx(x, abs=1e-4), pytest.approx(y + 3.0, abs=1e-4)]
     assert after["modes"][0]["goals"][1] == before["modes"][0]["goals"][1]
+    assert after["modes"][1]["goals"][0] == after["modes"][0]["goals"][0], "a goal is the same in all modes"
     moved = states(after)[0, -1] - states(before)[0, -1]
     assert moved[1] > 0.05
+    assert session.solve(Edit(scene=SCENE)) | {"milliseconds": 0} == before | {"milliseconds": 0}, "nothing is kept"
 
 
 def test_a_moved_agent_came_there_at_constant_velocity_and_the_network_is_asked_again(session: Session) -> None:
@@ -101,6 +104,42 @@ def test_the_description_has_what_is_drawn(session: Session) -> None:
     for agent in (0, 1):
         close(torch.tensor(found["agents"][agent]["history"]), scene.history[0, agent, :, :2])
         close(torch.tensor(found["agents"][agent]["future"]), scene.future[0, agent, :, :2])
+
+
+def test_steps_that_were_not_observed_are_not_drawn_and_those_of_a_moved_agent_are() -> None:
+    scenes = pretrained.examples(RUN)
+    mask = scenes.history_mask.clone()
+    mask[SCENE, 1, :3] = False
+    gappy = Session(epo_lightning.load(RUN), dataclasses.replace(scenes, history_mask=mask))
+    drawn = gappy.describe(SCENE)["agents"][1]["history"]
+    close(torch.tensor(drawn), scenes.history[SCENE, 1, 3:, :2])
+    moved = Edit(states={"1": [1.0, -2.0, 0.0, 0.8]}).moved(gappy.scenes[SCENE])
+    assert moved.history_mask.all()
+    assert not gappy.scenes.history_mask[SCENE, 1, :3].any(), "the scene itself stays as it is"
+
+
+def test_lanes_goals_and_the_nash_gap_are_those_of_the_scene_and_the_mode() -> None:
+    """On a road, where every mode has goals of its own."""
+    run = "highway_sim/hivt_m_epo"
+    forecaster, scenes = epo_lightning.load(run), pretrained.examples(run)[:2]
+    assert scenes.lanes is not None
+    assert scenes.lane_mask is not None
+    mask = scenes.lane_mask.clone()
+    mask[1, 3] = False
+    roads = Session(forecaster, dataclasses.replace(scenes, lane_mask=mask))
+    vectors = torch.cat([scenes.lanes[1, lane] for lane in range(mask.shape[1]) if lane != 3])
+    close(torch.tensor(roads.describe(1)["lanes"]), vectors)
+    forecast = forecaster.predict(roads.scenes[1])
+    assert forecast.parameters is not None
+    assert forecast.parameters.goals is not None
+    for mode in (1, 3):
+        answer = roads.solve(Edit(scene=1, mode=mode))
+        for each in range(5):
+            goals = torch.tensor([answer["modes"][each]["goals"][agent] for agent in range(4)])
+            close(goals, forecast.parameters.goals[0, each])
+        alone = torch.eye(5)[mode, None]
+        report = forecaster.examine(roads.scenes[1], dataclasses.replace(forecast, probabilities=alone))
+        assert answer["nash_gap"] == pytest.approx(float(equilibrium_values(report)["nash_gap_relative"]), rel=1e-4)
 
 
 edits = st.builds(
