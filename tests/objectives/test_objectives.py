@@ -21,14 +21,15 @@ from epo_lightning.scene import Scene
 
 
 def test_the_difference_after_the_forecast_is_a_mean_over_scenes() -> None:
-    """Two of three steps belong to the forecast. Four agents of one scene are off by 1 and 3, that of the other by 0."""
+    """Two of three steps belong to the forecast. Four agents of one scene are off by 1 and 3, that of the other by 4."""
     controls, none = torch.zeros(2, 1, 4, 3, 2), torch.zeros(2, 1)
     initial = controls.clone()
     initial[0, ..., 0], initial[0, ..., 1] = 1.0, 3.0
+    initial[1] = 4.0
     states = torch.zeros(2, 1, 4, 3, 4)
     present = torch.tensor([[True] * 4, [True] + [False] * 3])
     scene = Scene(history=torch.zeros(2, 4, 1, 4), dt=0.1, size=torch.ones(2, 4, 2), agent_mask=present)
-    for ahead, expected in ((2, 1.0), (3, 0.0)):
+    for ahead, expected in ((2, 3.0), (3, 0.0)):
         forecast = JointForecast(
             states=states[..., :ahead, :],
             probabilities=torch.ones(2, 1),
