@@ -100,6 +100,15 @@ def test_probabilities_of_repetitions_are_summed(case: tuple[list[float], list[i
         torch.testing.assert_close(gradient[0], softmax * (inside.double() - expected[mode]), atol=1e-12, rtol=1e-9)
 
 
+@pytest.mark.filterwarnings("ignore:Anomaly Detection")
+def test_derivatives_of_repetitions_are_no_nan_on_the_way_either() -> None:
+    """With ``debug=nan``, PyTorch raises an error at the first one, also at those that are left out later."""
+    decoded = torch.randn(1, 3, requires_grad=True)
+    with torch.autograd.detect_anomaly():
+        with_repeats_added(decoded, torch.tensor([[0, 0, 2]])).softmax(1)[0, 0].backward()
+    assert decoded.grad is not None
+
+
 def test_logits_without_repetitions_are_unchanged() -> None:
     logits = torch.randn(4, 3)
     assert torch.equal(with_repeats_added(logits, torch.arange(3).expand(4, 3)), logits)

@@ -238,6 +238,13 @@ def test_the_best_assignments_equal_those_of_a_sorted_list(seed, agents, count, 
             assert tuple(chosen[scene, mode].tolist()) == choice
 
 
+def test_more_modes_than_the_beam_keeps_are_all_different():
+    unary, pair, everyone = drawn(1, 2, 20)
+    _, energy = assignments.best(unary, pair, everyone, assignments.BEAM + 50)
+    ranked = sorted(entry[0] for entry in listed(unary[0], pair[0]))
+    assert energy[0].tolist() == pytest.approx(ranked[: assignments.BEAM + 50])
+
+
 def test_distinct_modes_equal_those_of_a_plain_loop():
     scenes, agents, count, modes, apart = 4, 3, 3, 7, 1.3
     unary, pair, everyone = drawn(scenes, agents, count)

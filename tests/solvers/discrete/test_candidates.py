@@ -170,13 +170,19 @@ def test_other_scenes_and_absent_agents_do_not_change_solutions(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("broken", ["no number", "minus infinity", "minus infinity of a pair", "nothing fits"])
+@pytest.mark.parametrize(
+    "broken",
+    ["no number", "minus infinity", "minus infinity of a pair", "nothing fits", "a triangle of two colours"],
+)
 def test_scenes_without_an_answer_stop_and_leave_the_others_alone(kind, broken):
     scene, game = played(scenes=3)
     unary, pair = torch.randn(3, 3, 3, dtype=torch.float64), torch.rand(3, 3, 3, 3, dtype=torch.float64)
     whole = kind(candidates=3, modes=2)(Given(unary.clone(), pair.clone()), scene, game)
     if broken == "nothing fits":
         pair[1, 0] = INF
+    elif broken == "a triangle of two colours":  # every pair can differ, but not all three; messages do not notice it
+        unary[1, :, 2] = INF
+        pair[1] = torch.where(torch.eye(3, dtype=torch.bool), INF, pair[1])
     elif broken == "minus infinity of a pair":
         pair[1, 2, 0, 1] = -INF
     else:
