@@ -13,11 +13,12 @@ import torch
 from epo_lightning.data.recorded.scenes import RecordedScenes
 from epo_lightning.data.recorded.windows import WindowConfig, extract
 from epo_lightning.data.simulate import recording, traffic
-from epo_lightning.data.simulate.demand import STYLES, Style
+from epo_lightning.data.simulate.demand import STYLES, Style, write_demand
 from epo_lightning.data.simulate.generate import map_path
 from epo_lightning.data.simulate.lanelets import write_map
 from epo_lightning.data.simulate.layout import LAYOUTS
 from epo_lightning.data.simulate.motion import Motion, move
+from epo_lightning.data.simulate.network import edges_of
 from epo_lightning.data.simulate.traffic import simulate
 from epo_lightning.registry import lookup
 
@@ -80,6 +81,15 @@ def test_drivers_brake_in_dense_traffic_and_free_traffic_is_the_default(
         hard.append((np.diff(speed)[same] * RATE < -1.5).mean())
     assert hard[1] > 0.02
     assert hard[1] > 3 * hard[0]
+
+
+def test_a_style_multiplies_the_headways_that_drivers_want(tmp_path: Path) -> None:
+    wanted = []
+    for headway in (1.0, 0.8):
+        random, path = np.random.default_rng(0), tmp_path / "routes.xml"
+        rows = write_demand(LAYOUTS[0], edges_of(LAYOUTS[0]), random, 60.0, path, Style(headway=headway))
+        wanted.append(np.array([row["tau"] for row in rows]))
+    np.testing.assert_allclose(wanted[1], 0.8 * wanted[0], atol=1e-3)
 
 
 @pytest.mark.slow
