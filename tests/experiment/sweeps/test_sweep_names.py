@@ -1,10 +1,12 @@
-"""Records of sweeps, and the names of sweeps, runs, folders and titles."""
+"""Records and status of sweeps, and the names of sweeps, runs, folders and titles."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 from experiment.conftest import TINY, Epo
@@ -12,7 +14,7 @@ from experiment.sweeps.rpi_sweep import SRC, the_sweep
 
 from epo_lightning.experiment.config.compose import compose, jobs
 from epo_lightning.experiment.sweeps.sweep import Job, Sweep, label
-from epo_lightning.experiment.sweeps.watch import names_of, result
+from epo_lightning.experiment.sweeps.watch import _scoring, how_far, names_of, result
 from epo_lightning.identity import identity
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, write_json
@@ -54,6 +56,23 @@ def test_a_damaged_record_of_a_run_is_said_in_its_line(tmp_path: Path, best: str
     for measures in ((), ("time",)):
         job = Job((), RunFolder(tmp_path), "0", "EPO", 0, measures)
         assert result(job).startswith(f"records in {tmp_path} are damaged (")
+
+
+def test_the_time_that_is_left_is_that_at_the_pace_since_the_run_went_on() -> None:
+    """Half of the steps after the resume are done, in two minutes."""
+    progress = {"step": 150, "steps": 200, "from_step": 100, "seconds": 120.0}
+    job = cast(Job, SimpleNamespace(run=SimpleNamespace(progress=progress, path="r", finished=False)))
+    assert how_far(job) == "step 150 of 200, 2 min left"
+    del progress["from_step"]
+    assert how_far(job) == "step 150 of 200, 40 s left"
+    progress["step"] = 0
+    assert how_far(job) == "step 0 of 200"
+
+
+def test_the_command_that_scores_a_run_names_the_split_that_it_lacks(tmp_path: Path) -> None:
+    for measures, split in ((("val",), " split=val"), (("test", "val"), ""), (("test",), "")):
+        job = Job((), RunFolder(tmp_path / "r"), "0", "EPO", 0, measures)
+        assert _scoring(job) == f"epo evaluate run={tmp_path / 'r'}{split}"
 
 
 def test_runs_of_one_title_and_seed_have_distinct_names(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import pytest
 
-from data.recorded.formats.test_commonroad import ROAD, beside, drive, lanelet, scenario, speeds
+from data.recorded.formats.commonroad_files import ROAD, beside, drive, lanelet, scenario, speeds
 from epo_lightning.data.recorded.formats.commonroad import commonroad
 from epo_lightning.data.recorded.formats.ucy import ucy
 from epo_lightning.data.recorded.tracks import Recording, RecordingError
