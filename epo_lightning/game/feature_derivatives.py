@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from epo_lightning.game import exported_derivatives
 from epo_lightning.game.circles import overlap
 from epo_lightning.game.features import SLOWEST_STEERING, OwnFeature, PairFeature, Source
 from epo_lightning.game.game_end import at_end, until
@@ -55,6 +56,9 @@ def differentiate(function: Callable[..., Tensor], value: Tensor, *others: Tenso
     def first(argument: Tensor) -> Tensor:
         return _jvp(lambda s: function(s, *others), argument)[1]
 
+    if torch.compiler.is_exporting():
+        once, twice = exported_derivatives.slopes(function, value, *others)
+        return Derivatives(function(value, *others), once, twice if second else None)
     if second:
         return Derivatives(function(value, *others), *_jvp(first, value))
     return Derivatives(*_jvp(lambda s: function(s, *others), value))
@@ -326,6 +330,8 @@ def undeclared_change(
     value = function(*at, *others)
     if len(directions[0]) == 0:
         return value, value.new_zeros(0, *value.shape)
+    if torch.compiler.is_exporting():
+        return value, exported_derivatives.change(function, at, directions, *others)
     return value, torch.func.vmap(
         lambda *moved: torch.func.jvp(lambda *states: function(*states, *others), at, moved)[1]
     )(*directions)
