@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -31,6 +33,15 @@ class Schedule(ABC):
     @abstractmethod
     def number(self, step: int) -> float:
         """The number at an optimisation step."""
+
+    @contextmanager
+    def holding(self, tensor: Tensor) -> Iterator[None]:
+        """Context of losses in which the tensor takes the place of the number."""
+        self.held = tensor
+        try:
+            yield
+        finally:
+            self.held = None
 
     def at(self, step: int) -> float | Tensor:
         """The number at an optimisation step, or the tensor that holds it."""

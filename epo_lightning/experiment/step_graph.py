@@ -12,7 +12,8 @@ host writes their numbers before every step. When one of them ends, the step is 
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from contextlib import ExitStack
 from typing import Any, NamedTuple
 
 import torch
@@ -85,7 +86,6 @@ class StepGraph(Callback):
     """
 
     def __init__(self) -> None:
-        self._schedules: Sequence[Schedule] = ()
         self._end()
 
     def _end(self) -> None:
@@ -93,9 +93,7 @@ class StepGraph(Callback):
         self._steps = 0
         self._parameters: list[nn.Parameter] = []
         self._layout: tuple[Any, ...] | None = None
-        for schedule in self._schedules:
-            schedule.held = None
-        self._schedules = ()
+        self._numbers: list[tuple[Schedule, Tensor]] = []
         self._changing: list[bool] = []
         self._replay: Callable[[Scene], Outcome] | None = None
 
@@ -116,9 +114,10 @@ class StepGraph(Callback):
         self._forecaster = forecaster
         self._parameters = [parameter for parameter in forecaster.parameters() if parameter.requires_grad]
         self._recorder = Recorder(forecaster.device)
-        self._schedules = forecaster.schedules
-        for schedule in self._schedules:
-            schedule.held = torch.zeros((), device=forecaster.device, dtype=self._parameters[0].dtype)
+        self._numbers = [
+            (schedule, torch.zeros((), device=forecaster.device, dtype=self._parameters[0].dtype))
+            for schedule in forecaster.schedules
+        ]
         forecaster.step_graph = self.step
 
     def step(self, scene: Scene) -> tuple[Tensor, dict[str, Tensor]]:
@@ -146,20 +145,22 @@ class StepGraph(Callback):
 
     def _write_numbers(self) -> None:
         """Bring the numbers of the loss at this step to the device; forget the graph if one of them has ended."""
-        numbers = [schedule.number(self._forecaster.global_step) for schedule in self._schedules]
+        numbers = [schedule.number(self._forecaster.global_step) for schedule, _ in self._numbers]
         changing = [number > 0 for number in numbers]
         if changing != self._changing:
             self._changing, self._replay = changing, None
-        for schedule, number in zip(self._schedules, numbers, strict=True):
-            assert schedule.held is not None
+        for (_, held), number in zip(self._numbers, numbers, strict=True):
             if number > 0:
-                schedule.held.fill_(number)
+                held.fill_(number)
 
     def _compute(self, scene: Scene) -> Outcome:
         # Without gradients to add to, the backward pass makes new tensors, which a replay overwrites.
         for parameter in self._parameters:
             parameter.grad = None
-        total, terms = self._forecaster.weighted_losses(scene)
+        with ExitStack() as held:
+            for schedule, number in self._numbers:
+                held.enter_context(schedule.holding(number))
+            total, terms = self._forecaster.weighted_losses(scene)
         total.backward()
         losses = torch.stack([total.detach(), *terms.values()])
         return Outcome(tuple(terms), losses, [parameter.grad for parameter in self._parameters])

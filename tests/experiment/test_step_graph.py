@@ -180,6 +180,19 @@ def test_losses_that_change_from_step_to_step_change_in_replays(name: str, key: 
     assert all(schedule.held is None for schedule in graphed.schedules), "usual steps have their numbers again"
 
 
+def test_losses_between_the_steps_have_the_numbers_of_python(again, monkeypatch) -> None:
+    """Such as those of a validation step or of a copy: the number of the last step would be an old one for them."""
+    objective = {**IMITATION, "relaxation": 0.5, "relaxation_steps": 11}
+    trained, usual, graph = forecaster(objective=objective), forecaster(objective=objective), StepGraph()
+    graph.begin(trained)
+    for scene in batches()[:5]:
+        graph.step(scene)
+    monkeypatch.setattr(Forecaster, "global_step", 10)
+    (loss, _), (expected, _) = trained.weighted_losses(scene), usual.weighted_losses(scene)
+    assert loss == expected
+    assert all(schedule.held is None for schedule in copy.deepcopy(trained).schedules)
+
+
 def test_a_training_that_fails_leaves_a_forecaster_that_trains_without_its_graph(again, monkeypatch) -> None:
     trained, usual = forecaster(), forecaster()
     monkeypatch.setattr(StepGraph, "_capture", lambda *_: (_ for _ in ()).throw(RuntimeError("out of memory")))
