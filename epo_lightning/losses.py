@@ -290,11 +290,11 @@ def goal(
 
     Averaged over the agents that have a candidate and whose last step was ``observed``.
     """
-    counts = observed & exists.any(-1)
-    way = torch.where((exists & counts[..., None])[..., None], candidates - final[:, :, None], torch.inf)
+    taught = observed & exists.any(-1)
+    way = torch.where((exists & taught[..., None])[..., None], candidates - final[:, :, None], torch.inf)
     closest = way.square().sum(-1).argmin(-1)
     cost = _cross_entropy(log_probabilities.mT, closest)
-    return _mean_over_agents(cost, counts[..., None]).mean()
+    return _mean_over_agents(cost, taught[..., None]).mean()
 
 
 def marginal_imitation(
