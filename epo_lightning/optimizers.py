@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from torch import nn
 
-from epo_lightning.checks import check_number
-from epo_lightning.registry import ConfigError, nearest, register
+from epo_lightning.checks import check_choice, check_number
+from epo_lightning.registry import ConfigError, register
 
 _SCHEDULES: dict[str, Callable[[float], float]] = {
     "constant": lambda progress: 1.0,
@@ -43,8 +43,7 @@ class Adam:
         check_number("optimizer.lr", self.lr)
         check_number("optimizer.shared_factor", self.shared_factor)
         check_number("optimizer.clip", self.clip, finite=False, null=True)
-        if self.schedule not in _SCHEDULES:
-            raise ConfigError(f"unknown optimizer.schedule {self.schedule!r}: {nearest(self.schedule, _SCHEDULES)}")
+        check_choice("optimizer.schedule", self.schedule, _SCHEDULES)
 
     def configure(
         self, parameters: Iterable[nn.Parameter], total_steps: float, shared: Sequence[nn.Parameter] = ()

@@ -27,14 +27,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from epo_lightning.checks import check_number
+from epo_lightning.checks import check_choice, check_number
 from epo_lightning.forecast import GameParameters
 from epo_lightning.game.circles import disc
 from epo_lightning.game.double_integrator import DoubleIntegrator
 from epo_lightning.game.energy import GRADIENT, RESIDUALS, Energy, check_names
 from epo_lightning.game.pair_order import ALONG, DIRECTIONS, PairOrder
 from epo_lightning.game.pairs import pair_mask, pairs
-from epo_lightning.registry import ConfigError, nearest, register
+from epo_lightning.registry import ConfigError, register
 from epo_lightning.scene import HEADING, SPEED, Scene, rotated
 
 FLOOR = 1e-3
@@ -176,10 +176,7 @@ class ConvexEnergy(Energy):
             raise ConfigError(
                 "energy.own of energy=convex must name acc and lat_acc: without them the solution is not unique"
             )
-        if self.direction not in DIRECTIONS:
-            raise ConfigError(
-                f"unknown energy.direction {self.direction!r}: {nearest(str(self.direction), DIRECTIONS)}"
-            )
+        check_choice("energy.direction", self.direction, DIRECTIONS)
         check_number("energy.gap [m]", self.gap, zero=True)
         check_number("energy.within [m]", self.within, finite=False)
         if self.lane is not None:

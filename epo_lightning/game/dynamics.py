@@ -17,7 +17,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from epo_lightning.registry import ConfigError, nearest, register
+from epo_lightning.checks import check_choice
+from epo_lightning.registry import register
 from epo_lightning.scene import ACCELERATION, HEADING, SPEED, TURN_RATE, heading_vector, velocities, wrapped
 
 _BETA = {"euler": 1.0, "semi_implicit": 0.0, "heun": 0.5}
@@ -71,10 +72,7 @@ class Unicycle:
     integrator: str = "euler"
 
     def __post_init__(self) -> None:
-        if self.integrator not in _BETA:
-            raise ConfigError(
-                f"unknown dynamics.integrator {self.integrator!r}: {nearest(str(self.integrator), _BETA)}"
-            )
+        check_choice("dynamics.integrator", self.integrator, _BETA)
 
     @property
     def beta(self) -> float:

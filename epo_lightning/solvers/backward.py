@@ -20,11 +20,11 @@ from typing import ClassVar
 
 import torch
 
-from epo_lightning.checks import check_whole
+from epo_lightning.checks import check_choice, check_whole
 from epo_lightning.forecast import GameParameters, Solution
 from epo_lightning.game.energy import GRADIENT, RESIDUALS, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
-from epo_lightning.registry import ConfigError, nearest, register
+from epo_lightning.registry import register
 from epo_lightning.scene import Scene
 from epo_lightning.solvers.base import PATH, STATIONARY, STEPS, TABLES, Minimiser, Stepwise
 from epo_lightning.solvers.gauss_newton import implicit
@@ -111,8 +111,7 @@ class Implicit(Backward):
     hessian: str = "exact"
 
     def __post_init__(self) -> None:
-        if self.hessian not in HESSIANS:
-            raise ConfigError(f"unknown backward.hessian {self.hessian!r}: {nearest(str(self.hessian), HESSIANS)}")
+        check_choice("backward.hessian", self.hessian, HESSIANS)
 
     @property
     def needs_from_energy(self) -> frozenset[str]:

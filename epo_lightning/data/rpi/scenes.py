@@ -10,13 +10,13 @@ import torch
 from jaxtyping import Bool, Integer
 from torch import Tensor
 
-from epo_lightning.checks import check_whole
+from epo_lightning.checks import check_choice, check_whole
 from epo_lightning.data import cache
 from epo_lightning.data.cache import SPLITS
 from epo_lightning.data.datamodule import SceneDataModule, epoch_generator
 from epo_lightning.data.rpi.game import RECIPE, GameConstants
 from epo_lightning.data.rpi.splits import PAPER_SIZES, RULES
-from epo_lightning.registry import ConfigError, nearest, register
+from epo_lightning.registry import ConfigError, register
 from epo_lightning.scene import Scene
 from epo_lightning.task import Task
 
@@ -143,10 +143,9 @@ class RPIData(SceneDataModule):
         check_whole("data.games", games, least=3)  # training, validation and test have main games of their own
         check_whole("data.placements", placements)
         self.games, self.placements = games, placements
-        named = {"solver": (solver, SOLVERS), "split": (split, RULES), "targets": (targets, TARGETS)}
-        for name, (value, known) in named.items():
-            if value not in known:
-                raise ConfigError(f"unknown data.{name} {value!r}: {nearest(str(value), known)}")
+        check_choice("data.solver", solver, SOLVERS)
+        check_choice("data.split", split, RULES)
+        check_choice("data.targets", targets, TARGETS)
         self.solver, self.split, self.targets = solver, split, targets
         if sizes is not None and (isinstance(sizes, str) or len(sizes) != len(SPLITS)):
             raise ConfigError(f"data.sizes is {sizes!r}, expected three numbers ({', '.join(SPLITS)}) or null for all")

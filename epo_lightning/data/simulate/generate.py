@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from epo_lightning.checks import check_choice
 from epo_lightning.data import cache
 from epo_lightning.data.simulate import recording
 from epo_lightning.data.simulate.demand import STYLES, Style
@@ -22,7 +23,7 @@ from epo_lightning.data.simulate.layout import LAYOUTS, Layout
 from epo_lightning.data.simulate.motion import move
 from epo_lightning.data.simulate.traffic import RATE, WARM_UP, simulate, simulator
 from epo_lightning.data.workers import Report, finished
-from epo_lightning.registry import ConfigError, nearest
+from epo_lightning.registry import ConfigError
 
 RECIPE = 2
 """Version of the simulation: raised whenever the same configuration would give other recordings."""
@@ -51,8 +52,7 @@ def config(
     Raises:
         ConfigError: a value is out of range.
     """
-    if traffic not in STYLES:
-        raise ConfigError(f"unknown data.traffic {traffic!r}: {nearest(str(traffic), tuple(STYLES))}")
+    check_choice("data.traffic", traffic, STYLES)
     known = [layout.id for layout in LAYOUTS]
     chosen = known if layouts is None else sorted(set(layouts))
     for layout in chosen:

@@ -19,11 +19,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from epo_lightning.checks import check_number, check_whole
+from epo_lightning.checks import check_choice, check_number, check_whole
 from epo_lightning.forecast import GameParameters, Solution, Status
 from epo_lightning.game.energy import FEATURES, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
-from epo_lightning.registry import ConfigError, nearest, register
+from epo_lightning.registry import register
 from epo_lightning.scene import Scene
 from epo_lightning.solvers.base import STATIONARY, Minimiser
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
@@ -69,8 +69,7 @@ class BestResponse(Minimiser):
         check_whole("solver.steps", self.steps, least=1)
         check_number("solver.tolerance", self.tolerance, zero=True)
         self.inner()  # checks its settings
-        if self.order not in ORDERS:
-            raise ConfigError(f"unknown solver.order {self.order!r}: {nearest(str(self.order), ORDERS)}")
+        check_choice("solver.order", self.order, ORDERS)
 
     @property
     def on_host(self) -> bool:

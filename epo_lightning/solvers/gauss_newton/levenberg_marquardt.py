@@ -15,11 +15,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from epo_lightning.checks import check_number, check_whole, is_number
+from epo_lightning.checks import check_choice, check_number, check_whole, is_number
 from epo_lightning.forecast import GameParameters, Solution
 from epo_lightning.game.energy import FEATURES, Energy
 from epo_lightning.game.feature_energy import FeatureEnergy
-from epo_lightning.registry import ConfigError, nearest, register
+from epo_lightning.registry import ConfigError, register
 from epo_lightning.scene import Scene
 from epo_lightning.solvers.base import PATH, STATIONARY, STEPS, Stepwise
 from epo_lightning.solvers.gauss_newton import adaptive, backends
@@ -88,8 +88,7 @@ class LevenbergMarquardt(Stepwise):
                 f"solver.damping must be {LARGEST_DAMPING:g} or less, not {self.damping:g}: its products leave the range of "
                 "single precision"
             )
-        if self.backend not in backends.NAMES:
-            raise ConfigError(f"unknown solver.backend {self.backend!r}: {nearest(str(self.backend), backends.NAMES)}")
+        check_choice("solver.backend", self.backend, backends.NAMES)
         if self.backend == "warp" and self.newton_steps:
             raise ConfigError(
                 "solver.backend=warp has no Newton steps: set solver.newton_steps=0, or choose solver.backend=auto, "
