@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from epo_lightning.game.pairs import pair_mask, pairs
-from epo_lightning.scene import HEADING, Scene, heading_vector, velocities
+from epo_lightning.scene import HEADING, Scene, heading_vector, observed_future, velocities
 
 ALONG, ACROSS = "along", "across"
 DIRECTIONS = (ALONG, ACROSS)
@@ -101,12 +101,10 @@ class PairOrder:
         Raises:
             ValueError: the scene has no future.
         """
-        if scene.future is None or scene.future_mask is None:
-            raise ValueError("observed orders are read from scene.future [B, N, K, 4], which is None")
+        future, observed = observed_future(scene, "observed orders are read from")
         first, second = pairs(scene.agent_mask.shape[1], scene.agent_mask.device)
-        observed = scene.future_mask & scene.agent_mask[..., None]
         together = observed[:, first] & observed[:, second]
-        position = torch.where(observed[..., None], scene.future[..., :2], 0.0)
+        position = torch.where(observed[..., None], future[..., :2], 0.0)
         apart = position[:, first] - position[:, second]
         if self.direction == ACROSS:
             decisive = torch.where(together, apart.square().sum(-1), torch.inf).argmin(-1)

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from epo_lightning.game.dynamics import Rollout, Unicycle
-from epo_lightning.scene import HEADING, SPEED, Scene, wrapped
+from epo_lightning.scene import HEADING, SPEED, Scene, observed_future, wrapped
 
 _SMOOTHNESS = 1e-2
 """mu relative to the mean of a channel's diagonal entries of J^T J, so that it has no unit."""
@@ -38,13 +38,10 @@ def observed_controls(
     Raises:
         ValueError: the scene has no future.
     """
-    if scene.future is None or scene.future_mask is None:
-        raise ValueError("controls are derived from scene.future [B, N, K, 4], which is None")
+    future, seen = observed_future(scene, "controls are derived from")
     with torch.no_grad():
-        present, dt = scene.agent_mask, scene.dt
-        seen = scene.future_mask & present[..., None]
-        start = torch.where(present[..., None], scene.current, 0.0)
-        future = torch.where(seen[..., None], scene.future, 0.0)
+        start, dt = scene.current_or_zero, scene.dt
+        future = torch.where(seen[..., None], future, 0.0)
         told = demonstrated(scene)
         if isinstance(dynamics, Unicycle):
             controls = _differences(start, future, seen, dt)
@@ -93,9 +90,7 @@ def demonstrated(scene: Scene) -> Bool[Tensor, "B N K"]:
     Raises:
         ValueError: the scene has no future.
     """
-    if scene.future_mask is None:
-        raise ValueError("controls are derived from scene.future [B, N, K, 4], which is None")
-    seen = scene.future_mask & scene.agent_mask[..., None]
+    _, seen = observed_future(scene, "controls are derived from")
     return seen.flip(-1).cumsum(-1).flip(-1) > 0
 
 
