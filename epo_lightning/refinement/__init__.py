@@ -118,12 +118,13 @@ def refine(
     learned = (*weights.values(), *margins.values(), inverse_temperature)
     origin = origin_of(scene, states.dtype)
     if origin is not None:
-        near = dataclasses.replace(scene, history=moved(scene.history, -origin[:, None, None]))
+        scene = dataclasses.replace(scene, history=moved(scene.history, -origin[:, None, None]))
+        states = moved(states, -origin[:, None, None, None])
     with torch.set_grad_enabled(torch.is_grad_enabled() and any(_requires_grad(value) for value in learned)):
         forecast = refined(
-            states if origin is None else moved(states, -origin[:, None, None, None]),
+            states,
             probabilities.log(),
-            scene if origin is None else near,
+            scene,
             energy,
             weights,
             margins,
