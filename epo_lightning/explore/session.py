@@ -99,8 +99,9 @@ class Session:
         edit.check(
             original, self.forecaster.modes, [name for names in self.forecaster.energy.weighted for name in names]
         )
-        inferred = self._infer(edit.moved(original)) if edit.states else self._inferred(edit.scene)
-        scene = edit.without_absent(edit.moved(original))
+        moved = edit.moved(original)
+        inferred = self._infer(moved) if edit.states else self._inferred(edit.scene)
+        scene = edit.without_absent(moved)
         decoded = time.perf_counter()
         assert inferred.parameters is not None
         parameters = edit.applied(inferred.parameters)
