@@ -79,10 +79,10 @@ class Motion:
 
 
 def savitzky_golay(
-    values: Float[np.ndarray, "T c"], dt: float, half: int, degree: int = DEGREE
+    values: Float[np.ndarray, "T c"], dt: float, half: int
 ) -> tuple[Float[np.ndarray, "t c"], Float[np.ndarray, "t c"], Float[np.ndarray, "t c"]]:
     """Value, first and second derivative of the polynomials fitted to ``half`` rows before and behind each row."""
-    powers = (np.arange(-half, half + 1) * dt)[:, None] ** np.arange(degree + 1)
+    powers = (np.arange(-half, half + 1) * dt)[:, None] ** np.arange(DEGREE + 1)
     fit = np.linalg.pinv(powers)
     middle = values.mean(0)  # avoids cancellation with large coordinates
 

@@ -24,7 +24,8 @@ from epo_lightning.warp_kernels import warp
 ARCHITECTURES = (80, 90)
 """Compute capabilities times ten: A100; H100 and H200."""
 HIGHWAY = Features(("goal", "lane", "velref", "vel", "acc", "jerk", "steer", "turnr", "turnacc"), ("proximity",))
-"""The energy of the highway setting of `benchmarks/games.py`."""
+STEPS = 20
+"""The energy of the highway setting of `benchmarks/games.py`, and its number of time steps."""
 _VALUE, _REGISTERS, _STACK = 0x04, 0x2F, 0x12  # a record with a payload, and the attributes of two of them
 
 
@@ -45,16 +46,8 @@ class Resources:
     code: int
 
 
-def compile_for(
-    architecture: int,
-    double: bool,
-    agents: int,
-    games: int,
-    folder: Path,
-    features: Features = HIGHWAY,
-    steps: int = 20,
-) -> dict[str, Resources]:
-    """The resources of both kernels.
+def compile_for(architecture: int, double: bool, agents: int, games: int, folder: Path) -> dict[str, Resources]:
+    """The resources of both kernels for games of :data:`HIGHWAY`.
 
     Args:
         architecture: one of :data:`ARCHITECTURES`.
@@ -62,12 +55,10 @@ def compile_for(
         agents: number of agents of a game.
         games: number of games of a launch.
         folder: where Warp writes source and machine code.
-        features: the features of the games.
-        steps: number of steps of a game.
     """
     wp = warp()
     dtype, device = torch.float64 if double else torch.float32, torch.device("cuda")
-    kernels = fused.kernels(dtype, agents, steps, games, device, features)
+    kernels = fused.kernels(dtype, agents, STEPS, games, device, HIGHWAY)
     found = {}
     for name in ("solve", "differentiate"):
         module = getattr(kernels, name).module
