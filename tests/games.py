@@ -145,30 +145,35 @@ def leaves_of(parameters: GameParameters) -> GameParameters:
 
 def widen(parameters: GameParameters, agents: int = 2, filling: float = float("nan")) -> GameParameters:
     """The game of a scene that :func:`pad` gave absent agents, all of them holding ``filling``."""
-    scenes, modes, given = parameters.initial_controls.shape[:3]
-    first, second = torch.triu_indices(given + agents, given + agents, 1)
+    given = parameters.initial_controls.shape[2]
+    _, second = torch.triu_indices(given + agents, given + agents, 1)
     real = second < given
 
-    def grow(tensor: torch.Tensor) -> torch.Tensor:
-        wide = tensor.new_full((scenes, modes, given + agents, *tensor.shape[3:]), 0)
-        wide[:, :, :given] = tensor
-        wide[:, :, given:] = filling if tensor.is_floating_point() else -99
-        return wide
+    def grow(tensor: torch.Tensor | None, dim: int = 2) -> torch.Tensor | None:
+        if tensor is None:
+            return None
+        shape = list(tensor.shape)
+        shape[dim] = agents
+        return torch.cat((tensor, tensor.new_full(shape, filling if tensor.is_floating_point() else -99)), dim)
 
-    def grow_pairs(weight: torch.Tensor) -> torch.Tensor:
-        wide = torch.full((scenes, modes, len(first)), filling, dtype=weight.dtype)
-        wide[:, :, real] = weight
+    def grow_pairs(tensor: torch.Tensor | None) -> torch.Tensor | None:
+        if tensor is None:
+            return None
+        wide = tensor.new_full((*tensor.shape[:2], len(real)), filling)
+        wide[..., real] = tensor
         return wide
 
     return GameParameters(
         own_weights={name: grow(weight) for name, weight in parameters.own_weights.items()},
         pair_weights={name: grow_pairs(weight) for name, weight in parameters.pair_weights.items()},
         initial_controls=grow(parameters.initial_controls),
-        goals=None if parameters.goals is None else grow(parameters.goals),
-        reference=None if parameters.reference is None else grow(parameters.reference),
-        goal_headings=None if parameters.goal_headings is None else grow(parameters.goal_headings),
-        reference_controls=None if parameters.reference_controls is None else grow(parameters.reference_controls),
+        goals=grow(parameters.goals),
+        reference=grow(parameters.reference),
+        context=grow(parameters.context, 1),
+        order=grow_pairs(parameters.order),
+        goal_headings=grow(parameters.goal_headings),
         margins={name: grow_pairs(margin) for name, margin in parameters.margins.items()},
+        reference_controls=grow(parameters.reference_controls),
     )
 
 

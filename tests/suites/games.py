@@ -6,7 +6,7 @@ import dataclasses
 from typing import Any
 
 import torch
-from games import pad, random_scene, reordered
+from games import pad, random_scene, reordered, widen
 
 from epo_lightning.forecast import GameParameters
 from epo_lightning.game.dynamics import Unicycle
@@ -56,36 +56,7 @@ def game_of(energy: Energy, scenes: int = 3, agents: int = 3, starts: int = MODE
 
 def padded(scene: Scene, parameters: GameParameters, filling: float, agents: int = 2) -> tuple[Scene, GameParameters]:
     """Game with absent agents appended, whose values are ``filling`` in every tensor."""
-    given = scene.agent_mask.shape[1]
-    _, second = torch.triu_indices(given + agents, given + agents, 1)
-    real = second < given
-
-    def grow(tensor: torch.Tensor | None, dim: int = 2) -> torch.Tensor | None:
-        if tensor is None:
-            return None
-        shape = list(tensor.shape)
-        shape[dim] = agents
-        return torch.cat((tensor, tensor.new_full(shape, filling if tensor.is_floating_point() else -99)), dim)
-
-    def grow_pairs(tensor: torch.Tensor | None) -> torch.Tensor | None:
-        if tensor is None:
-            return None
-        wide = tensor.new_full((*tensor.shape[:2], len(real)), filling)
-        wide[..., real] = tensor
-        return wide
-
-    return pad(scene, agents, filling=filling), GameParameters(
-        own_weights={name: grow(weight) for name, weight in parameters.own_weights.items()},
-        pair_weights={name: grow_pairs(weight) for name, weight in parameters.pair_weights.items()},
-        initial_controls=grow(parameters.initial_controls),
-        goals=grow(parameters.goals),
-        reference=grow(parameters.reference),
-        context=grow(parameters.context, 1),
-        order=grow_pairs(parameters.order),
-        goal_headings=grow(parameters.goal_headings),
-        margins={name: grow_pairs(margin) for name, margin in parameters.margins.items()},
-        reference_controls=grow(parameters.reference_controls),
-    )
+    return pad(scene, agents, filling=filling), widen(parameters, agents, filling)
 
 
 def in_order(
