@@ -186,7 +186,7 @@ class ImitationSchedule:
 
 
 def schedules_in(owner: object) -> list[Schedule]:
-    """The schedules among the attributes of an objective or a forecaster."""
+    """The schedules that are attributes of an objective or a forecaster; those within other objects are not found."""
     found: list[Schedule] = []
     for value in vars(owner).values():
         if isinstance(value, Schedule):

@@ -49,7 +49,8 @@ class Objective(ABC):
             forecast: the forecast with ``parameters`` and ``solution``, and with ``initial_states`` unless gradients reach
                 the initial strategies through the solution.
             energy: the energy that was minimised.
-            step: number of optimisation steps so far.
+            step: number of optimisation steps so far. In a CUDA graph, a number that is computed from it stays the same,
+                unless it is that of a :class:`~epo_lightning.losses.Schedule` among the attributes of the objective.
 
         Raises:
             ValueError: the scene has no future.
