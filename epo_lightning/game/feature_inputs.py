@@ -74,7 +74,7 @@ class FeatureInputs(Energy):
     @cached_property
     def between_steps(self) -> Sequence[str]:
         """Names of the features that may depend on more than one time step, or on a state and a control together."""
-        own = [name for name, feature in self.own_features.items() if not feature.stepwise]
+        own = [name for name, feature in self.own_features.items() if not feature.of_control_or_state]
         return [*own, *(name for name, pair in self.pair_features.items() if not (pair.declared or pair.stepwise))]
 
     @cached_property

@@ -104,7 +104,7 @@ class OwnFeature:
         return self.source not in (Source.STEP, Source.TRAJECTORY)
 
     @property
-    def stepwise(self) -> bool:
+    def of_control_or_state(self) -> bool:
         """Whether every residual depends on the control or on the next state of a single time step, and not on both."""
         return self.source not in (Source.RATE, Source.STEERING, Source.STEP, Source.TRAJECTORY)
 
