@@ -8,13 +8,13 @@ size, and along the direction also with their sign, which is positive where fore
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from benchmarks.command_line import parser_of
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.experiment.opening import open_checkpoint, open_data, settings_of, split_of
@@ -72,11 +72,7 @@ def scores(folder: str) -> tuple[str, int, list[float]]:
 
 def main(given: Sequence[str] | None = None) -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.along_across",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = parser_of("along_across", __doc__)
     parser.add_argument("runs", nargs="+", help="folders of finished runs")
     arguments = parser.parse_args(given)
     torch.set_num_threads(1)

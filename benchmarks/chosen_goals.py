@@ -10,7 +10,6 @@ validation split (``--split val``). Nothing is written.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import statistics
 from collections.abc import Collection, Sequence
@@ -20,6 +19,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from benchmarks.along_across import name_of
+from benchmarks.command_line import parser_of
 from epo_lightning import losses
 from epo_lightning.decoders.goals import choose, goal_candidates
 from epo_lightning.experiment import assembly
@@ -119,11 +119,7 @@ def scores(folder: str, split: str) -> tuple[str, int, list[float]]:
 
 def main(given: Sequence[str] | None = None) -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.chosen_goals",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = parser_of("chosen_goals", __doc__)
     parser.add_argument("runs", nargs="+", help="folders of finished runs of +EPO rows that choose goals")
     parser.add_argument("--split", choices=("test", "val"), default="test", help="split of the run's data (test)")
     arguments = parser.parse_args(given)

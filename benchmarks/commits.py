@@ -13,7 +13,6 @@ be absolute. Clones, and what they have trained, stay in ``--out`` and are used 
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import os
 import shlex
@@ -26,6 +25,7 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
+from benchmarks.command_line import parser_of
 from benchmarks.repeat import chosen, difference, one_line, trained_runs
 from epo_lightning.identity import data_recipe, essence
 from epo_lightning.registry import ConfigError
@@ -164,9 +164,7 @@ def compared(saved: SavedRun, out: Path, steps: int, overrides: Sequence[str]) -
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.commits", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of("commits", __doc__)
     parser.add_argument("words", nargs="+", help="results files (*.json), and overrides for both codes")
     parser.add_argument("--steps", type=int, default=100, help="an even number; the middle and the end are validated")
     parser.add_argument("--out", type=Path, default=Path("build/commits"), help="folder of clones and runs")

@@ -11,13 +11,13 @@ sent per scene, and CPU time per scene of all agents together. Nothing is writte
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import time
 from collections.abc import Sequence
 
 import torch
 
+from benchmarks.command_line import parser_of
 from benchmarks.refinement import forecasts
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.opening import open_checkpoint, settings_of
@@ -118,11 +118,7 @@ def _count(value: float) -> str:
 
 def main(given: Sequence[str] | None = None) -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.decentralised",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = parser_of("decentralised", __doc__)
     parser.add_argument("runs", nargs="+", help="folders of finished runs")
     parser.add_argument("--share", type=float, help="share of the scenes of the split (default: that of the run)")
     parser.add_argument("--split", choices=("test", "val"), default="test")

@@ -10,7 +10,6 @@ largest w. Nothing is written.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -19,6 +18,7 @@ from jaxtyping import Float
 from scipy import stats
 from torch import Tensor
 
+from benchmarks.command_line import parser_of
 from benchmarks.rpi_runs import forecasts
 from epo_lightning.experiment import assembly
 from epo_lightning.registry import ConfigError
@@ -72,11 +72,7 @@ def measure(folder: str) -> dict[str, Distances]:
 
 def main(given: Sequence[str] | None = None) -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.distance_by_weight",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = parser_of("distance_by_weight", __doc__)
     parser.add_argument("runs", nargs="+", help="folders of finished runs on RPI")
     arguments = parser.parse_args(given)
     torch.set_num_threads(1)

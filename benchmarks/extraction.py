@@ -7,7 +7,6 @@ Times are CPU seconds of one core. Reading, extraction and loading are measured 
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import TypeVar
 import numpy as np
 import torch
 
+from benchmarks.command_line import parser_of
 from benchmarks.measure import positive
 from epo_lightning.data.recorded.scenes import RecordedScenes
 from epo_lightning.data.recorded.tables import joined
@@ -62,11 +62,7 @@ def measure(folder: Path, format_: str, recordings: int, batches: int) -> None:
 
 def main(given: Sequence[str] | None = None) -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.extraction",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = parser_of("extraction", __doc__)
     parser.add_argument("folder", type=Path, help="recordings, see docs/highway.md")
     parser.add_argument("--format", default="exid", help="a registered format, such as exid, commonroad or ucy")
     parser.add_argument("--recordings", type=positive, default=3, help="the number of recordings to read")

@@ -12,7 +12,6 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from typing import Any
@@ -22,6 +21,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from benchmarks.command_line import parser_of
 from epo_lightning.drive.episodes import outside, play
 from epo_lightning.drive.measures import differences, estimate, measure
 from epo_lightning.drive.planners import ForecastPlanner, ResponsePlanner
@@ -195,11 +195,7 @@ def report(runs: Sequence[str], traffic: str, episodes: int, watched: int, seed:
 
 def main(given: Sequence[str] | None = None) -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.forecast_speed",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = parser_of("forecast_speed", __doc__)
     parser.add_argument("runs", nargs="+", metavar="RUN", help="folders of finished runs")
     parser.add_argument("--traffic", default="dense", help="kind of SUMO's traffic")
     parser.add_argument("--episodes", type=int, default=200)

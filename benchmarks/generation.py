@@ -9,7 +9,6 @@ that of the process that gathers the scenes, without pages of mapped files, whic
 
 from __future__ import annotations
 
-import argparse
 import json
 import multiprocessing
 import resource
@@ -26,6 +25,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from benchmarks.command_line import parser_of
 from benchmarks.measure import positive
 
 FRAMES, AGENTS, MAPS = 110, 12, 20
@@ -223,11 +223,7 @@ def print_cost(small: dict[str, float], large: dict[str, float], size: int) -> N
 
 def main(given: Sequence[str] | None = None) -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.generation",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = parser_of("generation", __doc__)
     parser.add_argument("--recordings", type=positive, default=5000, help="the number of scenarios, 20 or more")
     parser.add_argument("--workers", type=positive, default=2, help="the number of worker processes, 2 or more")
     parser.add_argument("--folder", type=Path, help="folder to make and keep, with the scenarios and the data sets")

@@ -14,13 +14,13 @@ meets the constraints was found, are counted and left out. Nothing is written.
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
+from benchmarks.command_line import parser_of
 from benchmarks.many_agents import intentions, largest_scenes, of_agents
 from epo_lightning import FeatureEnergy, GameParameters, LevenbergMarquardt, Scene, Solution
 from epo_lightning.experiment import assembly
@@ -111,11 +111,7 @@ def report(scene: Scene) -> None:
 
 def main(given: Sequence[str] | None = None) -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.hard_constraints",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = parser_of("hard_constraints", __doc__)
     parser.add_argument("words", nargs="+", help="the data, as for `epo generate`")
     parser.add_argument("--agents", type=int, default=8, help="largest number of agents")
     parser.add_argument("--scenes", type=int, default=64, help="number of scenes")

@@ -18,7 +18,6 @@ overlap [%]. Nothing is written.
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import time
 from collections.abc import Callable, Sequence
@@ -28,6 +27,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from benchmarks.command_line import parser_of
 from epo_lightning import FeatureEnergy, JointForecast, LevenbergMarquardt, Scene, refine
 from epo_lightning.decoders.gates import Gate, NearestGate, RadiusGate
 from epo_lightning.decoders.weights import PairWeights
@@ -183,11 +183,7 @@ def measured(scene: Scene, shape: str, chosen: dict[str, Gate | None], repeats: 
 
 def main(given: Sequence[str] | None = None) -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.many_agents",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = parser_of("many_agents", __doc__)
     parser.add_argument("words", nargs="+", help="the data, as for `epo generate`")
     parser.add_argument("--agents", type=int, nargs="+", default=[4, 8, 16, 32, 64], help="numbers N of agents")
     parser.add_argument("--scenes", type=int, default=16, help="number of scenes")

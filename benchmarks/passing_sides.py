@@ -10,7 +10,6 @@ run may have taught both sides in the one kind of record and one side in the oth
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -18,6 +17,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from benchmarks.command_line import parser_of
 from benchmarks.rpi_runs import forecasts
 from epo_lightning.experiment import assembly
 from epo_lightning.registry import ConfigError
@@ -94,11 +94,7 @@ def measure(folder: str) -> dict[str, Served]:
 
 def main(given: Sequence[str] | None = None) -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.passing_sides",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = parser_of("passing_sides", __doc__)
     parser.add_argument("runs", nargs="+", help="folders of finished runs on RPI")
     arguments = parser.parse_args(given)
     torch.set_num_threads(1)

@@ -11,11 +11,11 @@ positions to those of the closest joint mode, as means over agents and records. 
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 
 import torch
 
+from benchmarks.command_line import parser_of
 from benchmarks.rpi_runs import Forecasts, forecasts
 from epo_lightning.data.cache import SPLITS
 from epo_lightning.data.rpi.scenes import SUBSETS
@@ -37,11 +37,7 @@ def errors(found: Forecasts) -> dict[str, list[float]]:
 
 def main(given: Sequence[str] | None = None) -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.placements",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = parser_of("placements", __doc__)
     parser.add_argument("runs", nargs="+", help="folders of finished runs on RPI")
     parser.add_argument("--split", choices=SPLITS, default="test", help="which records")
     arguments = parser.parse_args(given)

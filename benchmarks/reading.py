@@ -9,7 +9,6 @@ and at random from the whole split. Limit the memory from outside, for example b
 
 from __future__ import annotations
 
-import argparse
 import resource
 import shutil
 import time
@@ -21,6 +20,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from benchmarks.command_line import parser_of
 from benchmarks.measure import positive
 from epo_lightning.data import cache
 from epo_lightning.data.datamodule import BatchSampler
@@ -72,9 +72,7 @@ def measure(title: str, data: RecordedScenes, batches: Iterator[Tensor], seconds
 
 def main(given: Sequence[str] | None = None) -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.reading", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of("reading", __doc__)
     parser.add_argument("source", type=Path, help="a recorded data set")
     parser.add_argument("--gigabytes", type=float, default=6.0, help="the least size of the split")
     parser.add_argument("--folder", type=Path, help="where the repeated data set is kept; default: beside the source")

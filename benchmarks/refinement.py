@@ -14,7 +14,6 @@ is written.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import functools
 import statistics
@@ -25,6 +24,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 import torch
 from torch import Tensor
 
+from benchmarks.command_line import parser_of
 from epo_lightning import FeatureEnergy, JointForecast, Scene, Solution, refine
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.settings import Settings
@@ -183,11 +183,7 @@ def report(
 @torch.no_grad()
 def main(given: Sequence[str] | None = None) -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.refinement",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = parser_of("refinement", __doc__)
     parser.add_argument("runs", nargs="+", help="folders of finished runs")
     parser.add_argument("--share", type=float, help="share of the scenes of the split (default: that of the run)")
     parser.add_argument("--split", choices=("test", "val"), default="test")

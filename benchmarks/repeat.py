@@ -11,12 +11,12 @@ are not trained again.
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from benchmarks.command_line import parser_of
 from epo_lightning.experiment.assembly import build_data
 from epo_lightning.experiment.config.compose import compose
 from epo_lightning.experiment.train import train
@@ -116,9 +116,7 @@ def validated(run: RunFolder) -> list[dict[str, str]]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.repeat", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of("repeat", __doc__)
     parser.add_argument("words", nargs="+", help="results files, and overrides such as data.folder=<recordings>")
     parser.add_argument("--out", type=Path, default=Path("build/repeat"), help="folder of the new runs")
     parser.add_argument("--longest", type=float, default=math.inf, help="longest training [s] that is repeated")

@@ -15,13 +15,13 @@ product. Means are over agents and records. Nothing is written.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from benchmarks.command_line import parser_of
 from benchmarks.rpi_runs import forecasts
 from epo_lightning.data.cache import SPLITS
 from epo_lightning.data.rpi.scenes import SUBSETS
@@ -37,11 +37,7 @@ def correlations(errors: Sequence[Float[Tensor, "B N 2"]]) -> Float[Tensor, "R R
 
 def main(given: Sequence[str] | None = None) -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.shared_errors",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = parser_of("shared_errors", __doc__)
     parser.add_argument("runs", nargs="+", help="folders of finished runs on the same data of RPI")
     parser.add_argument("--split", choices=SPLITS, default="test", help="which records")
     arguments = parser.parse_args(given)

@@ -9,7 +9,6 @@ agent; the forecasts are of whole scenes. Nothing is written.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 from collections.abc import Mapping, Sequence
 
@@ -17,6 +16,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from benchmarks.command_line import parser_of
 from benchmarks.goals import TURNING
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.opening import open_checkpoint, open_data, settings_of, split_of
@@ -63,9 +63,7 @@ def scores(folder: str) -> tuple[str, dict[str, tuple[int, Mapping[str, float]]]
 
 def main(given: Sequence[str] | None = None) -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.turning", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of("turning", __doc__)
     parser.add_argument("runs", nargs="+", help="folders of finished runs on recorded data")
     arguments = parser.parse_args(given)
     torch.set_num_threads(1)
