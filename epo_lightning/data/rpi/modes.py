@@ -10,12 +10,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from epo_lightning.data.rpi.game import GameConstants
+from epo_lightning.data.rpi.game import DISC_RADIUS, GameConstants
 from epo_lightning.data.rpi.solve import Solutions
 
 CLASSES = (1, -1)
 """Signs of the rotation of the line of sight."""
-SMALLEST_DISTANCE = 0.5
+SMALLEST_DISTANCE = 2 * DISC_RADIUS
 """Distance of the agents' centres [m] at which their discs touch."""
 TIE = 1e-6
 """Relative difference of costs below which the solution from the earlier start strategy is taken."""

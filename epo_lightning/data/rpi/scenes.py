@@ -14,7 +14,7 @@ from epo_lightning.checks import check_choice, check_whole
 from epo_lightning.data import cache
 from epo_lightning.data.cache import SPLITS
 from epo_lightning.data.datamodule import SceneDataModule, epoch_generator
-from epo_lightning.data.rpi.game import RECIPE, GameConstants
+from epo_lightning.data.rpi.game import DISC_RADIUS, RECIPE, GameConstants
 from epo_lightning.data.rpi.splits import PAPER_SIZES, RULES
 from epo_lightning.registry import ConfigError, register
 from epo_lightning.scene import Scene
@@ -23,8 +23,8 @@ from epo_lightning.task import Task
 TARGETS = ("executed", "sampled", "both")
 SOLVERS = ("potential", "feedback", "feedback_converged")
 SUBSETS = ("executed", "alternative")
-DISC_DIAMETER = 0.5
-"""Length and width [m] of an agent: a disc of radius 0.25 m."""
+DISC_DIAMETER = 2 * DISC_RADIUS
+"""Length and width [m] of an agent."""
 
 
 class RPIDataset:
