@@ -18,17 +18,14 @@ from experiment.dashboard_runs import ROW, events, facts, hyperparameters, in_fi
 
 from epo_lightning.experiment import logs
 from epo_lightning.experiment.config.settings import MLflowSettings, Settings
+from epo_lightning.experiment.dashboards.base import Facts
 from epo_lightning.experiment.dashboards.mlflow import MLflow
 from epo_lightning.experiment.dashboards.wandb import has_key
 from epo_lightning.run_folder import RunFolder, discover
 from epo_lightning.schema import read
 
 STEP = "trainer/global_step"
-
-
 WANDB = ("logger=[wandb]", "logger.wandb.patience=120")
-
-
 MLFLOW = ("logger=[mlflow]", "logger.mlflow.patience=120")
 """Dashboards that a busy machine does not switch off."""
 
