@@ -121,11 +121,13 @@ def writing(path: Path) -> Iterator[None]:
         advice = "make room, or set data.root to another folder"
         if number in (errno.EEXIST, errno.ENOTDIR, errno.EACCES, errno.EROFS):
             advice = "set data.root to a folder that can be written"
-        for link in (path, *path.parents):
-            if link.is_symlink() and not link.exists():
-                advice = (
-                    f"{link} is a link to {link.readlink()}, which does not exist: make that folder, or remove the link"
-                )
+        with suppress(OSError):  # of a folder that may not be searched, or of a name that is too long
+            for link in (path, *path.parents):
+                if link.is_symlink() and not link.exists():
+                    advice = (
+                        f"{link} is a link to {link.readlink()}, which does not exist: make that folder, or remove the "
+                        "link"
+                    )
         raise OSError(
             number, f"cannot write ({reason or error}): {advice}; finished work is kept", str(path)
         ) from error

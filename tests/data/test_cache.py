@@ -203,6 +203,16 @@ def test_a_full_disk_is_an_error_that_names_the_file(tmp_path, monkeypatch):
         assert not list(tmp_path.iterdir())
 
 
+def test_a_path_that_cannot_be_looked_at_is_refused_with_advice(tmp_path):
+    """Looking for a link in such a path fails like the write itself."""
+    folder = tmp_path / ("x" * 300)
+    with (
+        pytest.raises(OSError, match=r"cannot write .*set data\.root to another folder; finished work is kept"),
+        cache.writing(folder),
+    ):
+        folder.mkdir()
+
+
 @pytest.mark.parametrize("place", ["cache", "cache/rpi-1"])
 def test_a_link_to_nowhere_is_named_with_its_remedy(tmp_path, place):
     link = tmp_path / place
