@@ -43,7 +43,7 @@ def obstacle(energy: FeatureEnergy, scene: Scene, parameters: GameParameters) ->
 
 
 def unsupported(energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> str | None:
-    """The same for a game whose tensors are on the CPU, or are copied there."""
+    """Reason as of :func:`obstacle` for a game whose tensors are on the CPU, or are copied there."""
     custom, known = energy.custom, energy.built_in
     if custom is None or known is None:
         return "the compiled layer needs a built-in feature beside those of the user, such as acc with a small weight"
