@@ -116,13 +116,10 @@ class RecordedData(SceneDataModule):
         for name, value in (("test_share", test_share), ("val_share", val_share)):
             if not 0 < value < 1:
                 raise ConfigError(f"data.{name} must be a share between 0 and 1, not {value}")
-        for name, choice, known in (
-            ("frame", frame, FRAMES),
-            ("val_by", val_by, UNITS),
-            ("shape", shape, SHAPES),
-            ("duplicates", duplicates, DUPLICATES),
-        ):
-            check_choice(f"data.{name}", choice, known)
+        check_choice("data.frame", frame, FRAMES)
+        check_choice("data.val_by", val_by, UNITS)
+        check_choice("data.shape", shape, SHAPES)
+        check_choice("data.duplicates", duplicates, DUPLICATES)
         groups = None if test is None else tuple(str(group) for group in test)
         self.rule = SplitRule(groups, test_share, val_share, val_by, seed)
         self.duplicates = duplicates
@@ -240,9 +237,7 @@ class RecordedData(SceneDataModule):
 
     def _extracted(self) -> list[tuple[Path, dict[str, Any]]]:
         """Data sets in the cache that were extracted with these settings, and their configurations."""
-        return [
-            (folder, config) for folder, config in cache.configs(self.root, self.dataset_name) if self._gives(config)
-        ]
+        return [found for found in cache.configs(self.root, self.dataset_name) if self._gives(found[1])]
 
     def _gives(self, config: Mapping[str, Any]) -> bool:
         """Whether these settings, applied to the recordings that ``config`` names, give exactly ``config``."""
