@@ -123,7 +123,7 @@ class StepGraph(Callback):
     def step(self, scene: Scene) -> tuple[Tensor, dict[str, Tensor]]:
         """The weighted sum of the losses of a batch and every term; the parameters then have the gradients of the sum.
 
-        The host does not wait for the device, except once, for the capture.
+        The host does not wait for the device, except for a capture: one, and one more when a number of the loss has ended.
 
         Raises:
             ConfigError: the step cannot be captured, or it draws numbers on the CPU.
