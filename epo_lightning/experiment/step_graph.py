@@ -82,7 +82,8 @@ class Recorder:
 class StepGraph(Callback):
     """Callback that lets a :class:`Forecaster` take its training steps from a CUDA graph.
 
-    The first :data:`WARM_UP` batches, and batches of other shapes than the first one, are computed without the graph.
+    The first :data:`WARM_UP` batches, also after a number of the loss has ended, and batches of other shapes than the first
+    one are computed without the graph.
     """
 
     def __init__(self) -> None:
@@ -130,8 +131,8 @@ class StepGraph(Callback):
         """
         layout = _layout(scene)
         self._layout = self._layout or layout
-        self._steps += 1
         self._write_numbers()
+        self._steps += 1
         if self._steps <= WARM_UP or layout != self._layout:
             outcome = self._recorder.run(lambda: self._compute(scene))
         else:
@@ -148,7 +149,7 @@ class StepGraph(Callback):
         numbers = [schedule.number(self._forecaster.global_step) for schedule, _ in self._numbers]
         changing = [number > 0 for number in numbers]
         if changing != self._changing:
-            self._changing, self._replay = changing, None
+            self._changing, self._replay, self._steps = changing, None, 0
         for (_, held), number in zip(self._numbers, numbers, strict=True):
             if number > 0:
                 held.fill_(number)

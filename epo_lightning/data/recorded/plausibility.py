@@ -53,8 +53,8 @@ def doubts_of_lanes(lanes: LaneGraph) -> list[str]:
     if not wrong:
         return []
     return [
-        f"{len(wrong)} lines of lanes turn back by more than 90 degrees {TURNS} times or more, the first one is {wrong[0]}: "
-        "are their points in the order of driving?"
+        f"lines of lanes that turn back by more than 90 degrees {TURNS} times or more: {len(wrong)}, the first one is "
+        f"{wrong[0]}: are their points in the order of driving?"
     ]
 
 
