@@ -58,6 +58,7 @@ MISTAKES = {
     "train -m solver.steps=1,x": "solver.steps must be a whole number",
     "train --multrun": "'--multirun'",
     "train experimnt=rpi/v_lstm": "did you mean 'experiment'?",
+    "train hydra/launcher=loca": "unknown option hydra/launcher=loca: did you mean 'local'? known: basic, ",
     "train debug.foo=1": "needs a choice of debug",
     "predict solver=game": "solver is a choice of epo train, and a run keeps it",
     "report dat=x": "unknown key 'dat'",

@@ -114,7 +114,9 @@ def _missing_option(instance: Hydra, missing: str, message: str) -> str:
         return (
             f"{missing.removesuffix('.yaml')} is a plugin that is not installed: pip install 'epo_lightning[{package}]'"
         )
-    group, _, option = missing.removesuffix(".yaml").partition("/")
+    words = missing.removesuffix(".yaml").split("/")
+    depth = 2 if words[0] == "hydra" else 1  # Hydra's own groups lie in a folder of this name
+    group, option = "/".join(words[:depth]), "/".join(words[depth:])
     options = options_of(instance, group)
     if options and not option:
         return f"{group}= chooses nothing: {_known('', options)}"
