@@ -217,7 +217,7 @@ def jobs(name: str, overrides: Sequence[str], extra: Sequence[str] = ()) -> list
     """The overrides of every job that Hydra's basic sweeper would launch; empty for sweepers that search (Optuna).
 
     Raises:
-        ConfigError: as :func:`compose`, or the file of a sweep has no runs.
+        ConfigError: as :func:`compose`, the file of a sweep has no runs, or a glob or range stands for no value.
     """
     from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
     from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -240,6 +240,12 @@ def jobs(name: str, overrides: Sequence[str], extra: Sequence[str] = ()) -> list
             )
         arguments = [*params, *task]
         parsed = OverridesParser.create(config_loader=instance.config_loader).parse_overrides(arguments)
+        for one in parsed:
+            if one.is_sweep_override() and not any(True for _ in one.sweep_string_iterator()):
+                raise ConfigError(
+                    f"{one.input_line} matches nothing, so that there is nothing to run: correct it; "
+                    "`epo train --help` lists the options of all groups"
+                )
         batches = BasicSweeper.split_arguments(parsed, None)
         return [[str(text) for text in job] for batch in batches for job in batch]
 

@@ -220,3 +220,13 @@ def test_globs_find_experiments_in_folders() -> None:
     listed = jobs("train", ["experiment=glob('rpi/*')", "seed=1,2,3"])
     assert ["experiment=rpi/v_lstm_epo", "seed=2"] in listed
     assert len(listed) == 3 * len(list((SRC / "conf" / "experiment" / "rpi").glob("*.yaml")))
+
+
+@pytest.mark.parametrize("word", ["experiment=glob('rpi/v_lstn*')", "seed=range(3,3)"])
+@pytest.mark.parametrize("command", [("train", "-m"), ("sweep", "rpi_main")])
+def test_globs_and_ranges_without_a_value_are_refused(
+    refused: Callable[..., str], command: tuple[str, ...], word: str
+) -> None:
+    said = refused(*command, "data=drawn", "budget=smoke", word)
+    assert f"{word} matches nothing, so that there is nothing to run" in said
+    assert not Path("runs").exists()
