@@ -35,7 +35,9 @@ def test_points_in_another_order_are_named(name: str) -> None:
     lanes = road(curve(300.0))
     assert not doubts_of_lanes(lanes)
     (doubt,) = doubts_of_lanes(shuffled(lanes, 4, name))
-    assert doubt.startswith("lines of lanes that turn back by more than 90 degrees 2 times or more: 1, the first one is ")
+    assert doubt.startswith(
+        "lines of lanes that turn back by more than 90 degrees 2 times or more: 1, the first one is "
+    )
     assert f"the {name} line of lane {lanes.ids[4]}: are their points in the order of driving?" in doubt
 
 
