@@ -6,7 +6,6 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -92,18 +91,3 @@ def test_a_failure_in_a_worker_is_reported(sequential: Path) -> None:
     assert "FAILED, Diverged" in done.stdout
     assert "2 done, 2 failed" in done.stdout
     assert "Traceback" not in done.stdout + done.stderr
-
-
-@pytest.mark.skipif(
-    find_spec("hydra_plugins.hydra_joblib_launcher") is None, reason="the extra `local` is not installed"
-)
-def test_a_missing_package_of_a_launcher_is_named_at_once(
-    epo: Callable[..., int], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setitem(sys.modules, "joblib", None)  # so that importing it fails
-    monkeypatch.delitem(sys.modules, "hydra_plugins.hydra_joblib_launcher._core", raising=False)
-    assert epo("sweep", "rpi_main", *WORDS, "experiment=rpi/const_vel", "hydra/launcher=local") == 2
-    printed = capsys.readouterr()
-    assert "the launcher needs a package that is not installed" in printed.err
-    assert "joblib" in printed.err
-    assert "broke down" not in printed.out, "a further start would fail in the same way"

@@ -318,9 +318,6 @@ def launch(
 
     Returns:
         one entry per job, with its result or the exception that it raised.
-
-    Raises:
-        ConfigError: a mistake in the configuration, or a package of the launcher that is not installed.
     """
     from hydra._internal.callbacks import Callbacks
     from hydra.core.plugins import Plugins
@@ -335,12 +332,7 @@ def launch(
             config=config,
         )
         callbacks.on_multirun_start(config=config, config_name=name)
-        try:
-            done = launcher.launch(jobs, initial_job_idx=0)
-        except ModuleNotFoundError as error:  # those of a job are in the job's entry
-            raise ConfigError(
-                f"the launcher needs a package that is not installed ({error}): install it, or leave out hydra/launcher"
-            ) from error
+        done = launcher.launch(jobs, initial_job_idx=0)
         callbacks.on_multirun_end(config=config, config_name=name)
     return done
 
