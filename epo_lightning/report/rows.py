@@ -160,7 +160,7 @@ def of_different_batches(rows: Sequence[Row]) -> list[str]:
         sizes: dict[str, list[str]] = {}
         for row in rows:
             if row.runs[0].data == data and row.runs[0].learned:
-                sizes.setdefault(value_text(_setting(row.runs[0].config, BATCH)), []).append(row.name)
+                sizes.setdefault(value_text(setting(row.runs[0].config, BATCH)), []).append(row.name)
         if len(sizes) > 1:
             ordered = sorted(sizes.items(), key=lambda entry: (len(entry[0]), entry[0]))  # of numbers
             groups = "; ".join(f"{size}: {', '.join(dict.fromkeys(names))}" for size, names in ordered)
@@ -226,12 +226,18 @@ def require_comparable(runs: Sequence[EvaluatedRun]) -> None:
     require_same(learned, "data_digest (trained on)", lambda run: run.trained_digest)
     require_same(learned, "budget", lambda run: run.budget)
     require_same(learned, "checkpoint", lambda run: run.checkpoint)
-    found = {key for run in learned for key, _, _ in differences(learned[0].config, run.config)}
-    for key in sorted(key for key in found if key.split(".")[0] in CONDITIONS and key != BATCH):
-        require_same(learned, key, lambda run, key=key: value_text(_setting(run.config, key)))  # type: ignore[misc]
+    for key in unequal_conditions([run.config for run in learned]):
+        require_same(learned, key, lambda run, key=key: value_text(setting(run.config, key)))  # type: ignore[misc]
 
 
-def _setting(config: Mapping[str, Any], key: str) -> Any:
+def unequal_conditions(configs: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Dotted keys of :data:`CONDITIONS`, without :data:`BATCH`, in which resolved configurations differ, in order."""
+    found = {key for config in configs for key, _, _ in differences(configs[0], config)}
+    return sorted(key for key in found if key.split(".")[0] in CONDITIONS and key != BATCH)
+
+
+def setting(config: Mapping[str, Any], key: str) -> Any:
+    """The value of a dotted key of a configuration; None where there is none."""
     value: Any = config
     for part in key.split("."):
         value = value.get(part) if isinstance(value, Mapping) else None
@@ -273,7 +279,7 @@ def _row(runs: Sequence[EvaluatedRun]) -> Row:
                 f"row {run.name!r}: {one.path} was scored by {metric} and {other.path} was not: "
                 f"epo evaluate run={other.path} split={run.split} scores it again"
             )
-    steps = _setting(first.config, "solver.steps") if first.forecaster == "epo" else None
+    steps = setting(first.config, "solver.steps") if first.forecaster == "epo" else None
     known = (first.data, first.backbone, first.forecaster, first.goal, first.experiment, first.split, steps)
     in_paper = is_papers(first.forecaster, first.config) and (first.forecaster != "epo" or interacts(first.config))
     paper = paper_values(*known) if in_paper else {}

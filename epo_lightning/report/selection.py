@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.labels import natural, word
-from epo_lightning.report.rows import BATCH, Row, plain_rows, require_comparable
+from epo_lightning.report.rows import BATCH, Row, plain_rows, require_comparable, setting
 from epo_lightning.report.runs import EvaluatedRun
 
 SEARCHED = ("optimizer", "backbone", "forecaster")
@@ -23,6 +24,7 @@ class BestSetting:
     Attributes:
         row: runs and scores of the setting.
         metric: metric on the validation split that chose it.
+        settings: its values by dotted key, of the searched settings and of those that the command of the search fixed.
         words: overrides that train with it: ``experiment=rpi/v_lstm optimizer.lr=0.0005``.
         compared: runs and scores of all settings compared, the best one included.
         left_out: labels of settings that lack seeds or have no finite score.
@@ -30,6 +32,7 @@ class BestSetting:
 
     row: Row
     metric: str
+    settings: Mapping[str, Any]
     words: str
     compared: tuple[Row, ...]
     left_out: tuple[str, ...]
@@ -37,10 +40,6 @@ class BestSetting:
     @property
     def title(self) -> str:
         return self.row.title
-
-    @property
-    def settings(self) -> Mapping[str, Any]:
-        return self.row.settings
 
     @property
     def experiment(self) -> str:
@@ -97,13 +96,19 @@ def _best(runs: list[EvaluatedRun], rows: list[Row], metric: str) -> BestSetting
         )
     best = min(whole, key=lambda row: (row.cells[metric].mean, natural(row.settings)))
     left_out = tuple(row.name for row in rows if row not in whole)
-    return BestSetting(best, metric, _words(best), tuple(whole), left_out)
+    settings = dict(sorted({**_fixed(best.runs[0]), **best.settings}.items()))
+    return BestSetting(best, metric, settings, _words(best.runs[0], settings), tuple(whole), left_out)
 
 
-def _words(row: Row) -> str:
-    run = row.runs[0]
+def _fixed(run: EvaluatedRun) -> dict[str, Any]:
+    """The settings of :data:`SEARCHED` sections that the command of a run gives: a search may fix some for all runs."""
+    keys = (word.lstrip("+").partition("=")[0] for word in shlex.split(run.command))
+    return {key: setting(run.config, key) for key in sorted({*keys}) if "." in key and _is_searched(key)}
+
+
+def _words(run: EvaluatedRun, settings: Mapping[str, Any]) -> str:
     parts = [f"data={run.data}", f"backbone={run.backbone}", f"forecaster={run.forecaster}"]
     chosen = [f"experiment={run.experiment}"] if run.experiment else parts
     if run.experiment and run.config["data"].get("split") == "hard":
         chosen += [f"data={run.data}"]
-    return " ".join([*chosen, *(word(key, value) for key, value in row.settings.items())])
+    return " ".join([*chosen, *(word(key, value) for key, value in settings.items())])

@@ -32,11 +32,13 @@ def make_run(
     split: str = "test",
     experiment: str | None = None,
     settings: Mapping[str, Any] | None = None,
+    command: str = "",
 ) -> RunFolder:
     """Write a run folder, evaluated if there are metrics; called again with another split, it is evaluated on both.
 
     Args:
         settings: values of the configuration by dotted key.
+        command: recorded command of the training.
     """
     config: dict[str, Any] = {
         "title": title,
@@ -59,7 +61,7 @@ def make_run(
         "data_digest": trained_digest or digest,
         "git_commit": "0123456789abcdef",
         "parameters": 1234,
-        "command": f"epo train experiment={experiment} seed={seed}",
+        "command": command or f"epo train experiment={experiment} seed={seed}",
     }
     run = RunFolder(path)
     run.begin(config, record)

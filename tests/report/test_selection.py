@@ -122,3 +122,19 @@ def test_settings_varied_for_comparison_are_not_selected(tmp_path: Path, key: st
     for value in (1, 2):
         make_run(tmp_path / str(value), "own", "epo", scores(value), split="val", settings={key: value})
     assert best(tmp_path) == []
+
+
+def test_settings_that_a_search_fixes_belong_to_the_best_setting(tmp_path: Path) -> None:
+    fixed = (
+        "backbone.width=64 data.batch_size=16 +optimizer.clip=0.5 data.placements=8 solver.steps=4 forecaster.modes=3"
+    )
+    for lr, value in ((0.001, 0.3), (0.002, 0.2)):
+        make_run(
+            tmp_path / str(lr), "V-LSTM", "marginal", scores(value), split="val", experiment="rpi/v_lstm",
+            settings={"optimizer.lr": lr, "backbone.width": 64, "data.batch_size": 16, "optimizer.clip": 0.5},
+            command=f"epo train experiment=rpi/v_lstm optimizer.lr={lr} {fixed} budget=short seed=0",
+        )  # fmt: skip
+    (found,) = best(tmp_path)
+    chosen = "backbone.width=64 data.batch_size=16 optimizer.clip=0.5 optimizer.lr=0.002"
+    assert found.words == f"experiment=rpi/v_lstm {chosen}"
+    assert [f"{key}={value}" for key, value in found.settings.items()] == chosen.split()
