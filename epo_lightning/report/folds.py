@@ -13,6 +13,9 @@ from dataclasses import replace
 from epo_lightning.identity import row_identity
 from epo_lightning.report.runs import EvaluatedRun
 
+FOLD = "data.test"
+"""The setting in which the folds of a data set differ."""
+
 
 def named_by_fold(runs: Iterable[EvaluatedRun]) -> list[EvaluatedRun]:
     """Runs whose data set has the groups of their test split in its name, if runs on it have different ones."""

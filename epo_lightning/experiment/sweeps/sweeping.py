@@ -7,7 +7,7 @@ import os
 import shlex
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,9 @@ from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.report.choices import Choices, read_choices
 from epo_lightning.report.entries import TEXT, WHOLE, check_entries
+from epo_lightning.report.folds import FOLD
 from epo_lightning.report.labels import value_text, word
+from epo_lightning.report.rows import unequal_conditions
 from epo_lightning.run_folder import RunFolder, numbered, read_json
 from epo_lightning.schema import read
 
@@ -191,10 +193,12 @@ def _listed(sweep: Sweep, words: Sequence[str], extra: Sequence[str], choices: C
     Searching sweeps choose their runs later, and have none here. A time that was measured with other settings is renamed.
 
     Raises:
-        ConfigError: a mistake in a configuration, a folder that holds something else, or data that is missing.
+        ConfigError: a mistake in a configuration, a folder that holds something else, data that is missing, or runs that no
+            table may compare.
     """
     jobs: dict[Path, Job] = {}
     ready: set[str] = set()
+    scored: dict[str, list[dict[str, Any]]] = {}
     for overrides in _overrides_of_runs(words, choices, extra):
         config = compose.compose("train", overrides, extra)
         job = Job.of(config, overrides)
@@ -210,8 +214,26 @@ def _listed(sweep: Sweep, words: Sequence[str], extra: Sequence[str], choices: C
         if data not in ready and sweep.state(job) != "done":
             assembly.build_data(config["data"]).setup("fit")
             ready.add(data)
+        if {*job.measures} - {"time"}:
+            scored.setdefault(job.data, []).append(config)
         jobs.setdefault(job.run.path, job)
+    for data, configs in scored.items():
+        _refuse_incomparable(data, configs)
     return list(jobs.values())
+
+
+def _refuse_incomparable(data: str, configs: Sequence[Mapping[str, Any]]) -> None:
+    """Refuse scored runs on one data set that differ in conditions which must be equal for all rows of a table.
+
+    Folds are no such runs: they have different test groups, and tables of their own.
+    """
+    budgets = {str(config["budget"]["name"]): "" for config in configs}
+    keys = ["budget"] if len(budgets) > 1 else [key for key in unequal_conditions(configs) if key != FOLD]
+    if keys:
+        raise ConfigError(
+            f"the runs of this sweep on {data} differ in {', '.join(keys)}, which must be equal for all rows of a table, so "
+            "that `epo report` would refuse them: give the command of the sweep once for every value"
+        )
 
 
 def _with_choices(listed: Sequence[list[str]], choices: Choices, extra: Sequence[str]) -> list[list[str]]:

@@ -14,6 +14,7 @@ from experiment.sweeps.rpi_sweep import SRC, the_sweep
 
 from epo_lightning.experiment.config.compose import compose, jobs
 from epo_lightning.experiment.sweeps.sweep import Job, Sweep, label
+from epo_lightning.experiment.sweeps.sweeping import _listed
 from epo_lightning.experiment.sweeps.watch import _scoring, how_far, names_of, result
 from epo_lightning.identity import identity
 from epo_lightning.registry import ConfigError
@@ -230,3 +231,27 @@ def test_globs_and_ranges_without_a_value_are_refused(
     said = refused(*command, "data=drawn", "budget=smoke", word)
     assert f"{word} matches nothing, so that there is nothing to run" in said
     assert not Path("runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("word", "key"),
+    [
+        ("callbacks.patience=1,2", "callbacks.patience"),
+        ("trainer.max_epochs=1,2", "trainer.max_epochs"),
+        ("data.scenes=32,64", "data.scenes"),
+        ("budget=smoke,untrained", "budget"),
+    ],
+)
+def test_runs_that_no_table_may_compare_are_refused_before_they_begin(
+    refused: Callable[..., str], word: str, key: str
+) -> None:
+    words = ["experiment=rpi/v_lstm", "seed=0", "data=drawn", "data.like=rpi", "score=val"]
+    said = refused("sweep", "rpi_main", *words, *(["budget=smoke"] if key != "budget" else []), word)
+    assert f"the runs of this sweep on drawn (rpi) differ in {key}, which must be equal" in said
+
+
+def test_settings_that_a_table_compares_and_times_are_not_refused(tmp_path: Path) -> None:
+    words = ["experiment=rpi/v_lstm", "seed=0", "data=drawn", "data.like=rpi", "budget=smoke"]
+    for more in (["data.batch_size=8,16", "optimizer.lr=0.1,0.2"], ["score=time", "data.scenes=32,64"]):
+        listed = _listed(Sweep(tmp_path / "runs" / "sweeps" / "a"), ["sweeps=rpi_main", "score=val", *words, *more], [])
+        assert len(listed) == (4 if "score=time" not in more else 2)
