@@ -91,3 +91,21 @@ def test_a_failure_in_a_worker_is_reported(sequential: Path) -> None:
     assert "FAILED, Diverged" in done.stdout
     assert "2 done, 2 failed" in done.stdout
     assert "Traceback" not in done.stdout + done.stderr
+
+
+@pytest.mark.skipif(
+    find_spec("hydra_plugins.hydra_joblib_launcher") is None, reason="the extra `local` is not installed"
+)
+def test_a_missing_package_of_a_launcher_is_named_at_once(tmp_path: Path) -> None:
+    # In a process of its own, in which Hydra's plugin has not been imported yet.
+    program = "import sys; sys.modules['joblib'] = None; from epo_lightning.cli import main; main(sys.argv[1:])"
+    words = ["sweep", "rpi_main", *WORDS, "experiment=rpi/const_vel", "hydra/launcher=local"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, "-c", program, *words],
+        cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=500, check=False,
+    )  # fmt: skip
+    assert done.returncode == 2, done.stdout + done.stderr
+    assert "the launcher needs a package that is not installed" in done.stderr
+    assert "joblib" in done.stderr
+    assert "broke down" not in done.stdout, "a further start would fail in the same way"

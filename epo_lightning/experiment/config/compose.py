@@ -318,6 +318,9 @@ def launch(
 
     Returns:
         one entry per job, with its result or the exception that it raised.
+
+    Raises:
+        ConfigError: a mistake in the configuration, or a package of the launcher that is not installed.
     """
     from hydra._internal.callbacks import Callbacks
     from hydra.core.plugins import Plugins
@@ -332,7 +335,12 @@ def launch(
             config=config,
         )
         callbacks.on_multirun_start(config=config, config_name=name)
-        done = launcher.launch(jobs, initial_job_idx=0)
+        try:
+            done = launcher.launch(jobs, initial_job_idx=0)
+        except ModuleNotFoundError as error:  # those of a job are in the job's entry
+            raise ConfigError(
+                f"the launcher needs a package that is not installed ({error}): install it, or leave out hydra/launcher"
+            ) from error
         callbacks.on_multirun_end(config=config, config_name=name)
     return done
 
