@@ -105,6 +105,34 @@ class ModelCheckpoint(of_lightning.ModelCheckpoint):
         super().load_state_dict({**state_dict, **moved})
 
 
+class LastCheckpoint(ModelCheckpoint):
+    """The checkpoint of the end of an epoch, which gets its name ``last`` when the epoch's row is in the log.
+
+    Lightning logs that row after all callbacks. A run that is stopped in between continues from the epoch before, so that
+    its log has every row.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(
+            folder, filename="ended", save_on_train_epoch_end=True, every_n_epochs=1, enable_version_counter=False
+        )
+        self._ended, self._last = folder / "ended.ckpt", folder / "last.ckpt"
+
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if trainer.is_global_zero:
+            self._ended.unlink(missing_ok=True)  # of a run that was stopped before the row
+
+    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._name_last(trainer)
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._name_last(trainer)
+
+    def _name_last(self, trainer: Trainer) -> None:
+        if trainer.is_global_zero and self._ended.is_file():
+            self._ended.replace(self._last)
+
+
 class EarlyStopping(of_lightning.EarlyStopping):
     """Lightning's EarlyStopping, which also stops a continued run that had run out of patience before it was killed."""
 
@@ -233,10 +261,7 @@ def run_callbacks(settings: CallbackSettings, run: RunFolder, title: str) -> lis
         save_on_train_epoch_end=False,
         enable_version_counter=False,
     )
-    last = ModelCheckpoint(
-        run.checkpoints, filename="last", save_on_train_epoch_end=True, every_n_epochs=1, enable_version_counter=False
-    )
-    found: list[Callback] = [NextEpoch(), RandomStates(), Progress(run), best, last]
+    found: list[Callback] = [NextEpoch(), RandomStates(), Progress(run), best, LastCheckpoint(run.checkpoints)]
     if settings.patience is not None:
         stopping = EarlyStopping(
             settings.monitor,

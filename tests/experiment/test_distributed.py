@@ -242,8 +242,7 @@ def test_followers_end_with_the_leader_and_the_run_can_continue(epo: Epo, how: s
     leader = subprocess.Popen(
         [sys.executable, "-m", "epo_lightning.cli", *words], env={**os.environ, "PYTHONPATH": str(ROOT)}
     )
-    # Lightning logs the losses of an epoch just after its checkpoint; a stop in between would lose this row of the log.
-    until(lambda: Path("parts/checkpoints/last.ckpt").is_file() and "train/loss" in {name for _, name in log("parts")})
+    until(lambda: Path("parts/checkpoints/last.ckpt").is_file())
     (follower,) = followers(leader.pid)
     leader.send_signal(how)
     assert leader.wait(30) != 0

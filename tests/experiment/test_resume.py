@@ -6,16 +6,18 @@ import os
 import resource
 import shutil
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 import torch
 from experiment.conftest import TINY, Epo
+from lightning.pytorch import Trainer
 
 from epo_lightning.experiment import train as training
-from epo_lightning.experiment.callbacks import RandomStates
+from epo_lightning.experiment.callbacks import LastCheckpoint
+from epo_lightning.experiment.csv_log import CSVLog
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, read_json
@@ -46,16 +48,16 @@ def same(one: str, two: str) -> bool:
 
 
 def stop_before_epoch(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A power failure as the epoch begins."""
-    original, starts = RandomStates.on_train_epoch_start, []
+    """A power failure as the epoch begins, when the one before it is stored."""
+    original, starts = LastCheckpoint.on_train_epoch_start, []
 
-    def stop(self: RandomStates, trainer: object, module: object) -> None:
+    def stop(self: LastCheckpoint, trainer: Trainer, module: Forecaster) -> None:
         starts.append(1)
+        original(self, trainer, module)
         if len(starts) == number:
             raise RuntimeError("power failure")
-        original(self, trainer, module)
 
-    monkeypatch.setattr(RandomStates, "on_train_epoch_start", stop)
+    monkeypatch.setattr(LastCheckpoint, "on_train_epoch_start", stop)
 
 
 def begin_and_stop(epo: Epo, run: str, number: int, *words: str) -> None:
@@ -75,6 +77,31 @@ def test_a_run_that_was_moved_keeps_its_best_epoch(epo: Epo) -> None:
     assert epo("train", "resume=elsewhere/moved") == 0
     assert same("whole", "elsewhere/moved")
     assert not Path("parts").exists()
+
+
+@pytest.mark.parametrize("logged", [False, True])
+def test_a_run_that_is_stopped_at_the_end_of_an_epoch_logs_every_epoch_once(epo: Epo, logged: bool) -> None:
+    assert epo(*WORSENING, "run_dir=whole") == 0
+    log = CSVLog.log_metrics
+
+    def stop(self: CSVLog, metrics: Mapping[str, float], step: int | None = None) -> None:
+        ends = metrics["epoch"] == 1 and "train/loss" in metrics
+        assert not ends or Path("parts/checkpoints/ended.ckpt").is_file(), (
+            "the epoch is stored before its row is logged"
+        )
+        if logged or not ends:
+            log(self, metrics, step)
+        if ends:
+            raise RuntimeError("power failure")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(CSVLog, "log_metrics", stop)
+        with pytest.raises(RuntimeError, match="power failure"):
+            epo(*WORSENING, "run_dir=parts")
+    assert torch.load("parts/checkpoints/last.ckpt", weights_only=True)["epoch"] == 0
+    assert epo("train", "resume=parts") == 0
+    assert same("whole", "parts")
+    assert sorted(path.name for path in Path("parts/checkpoints").iterdir()) == ["best.ckpt", "last.ckpt"]
 
 
 def test_a_run_that_had_stopped_early_makes_no_further_step(epo: Epo) -> None:
