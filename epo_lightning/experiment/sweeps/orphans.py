@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import threading
 import time
@@ -10,10 +11,10 @@ from functools import cache
 
 @cache
 def end_with(driver: int) -> None:
-    """End this process when the process ``driver`` ends, if it is a child of the driver.
+    """End this process when the process ``driver`` ends, or has ended already, if that process started it.
 
     Otherwise the worker processes of joblib would continue, wait for further work and keep the terminal occupied. Jobs of a
-    cluster are not children of the driver and continue.
+    cluster have another parent and continue.
     """
 
     def watch() -> None:
@@ -21,5 +22,6 @@ def end_with(driver: int) -> None:
             time.sleep(0.5)
         os._exit(1)
 
-    if os.getppid() == driver:
+    parent = multiprocessing.parent_process()  # also if it has ended, unlike os.getppid
+    if parent is not None and parent.pid == driver:
         threading.Thread(target=watch, name="orphan", daemon=True).start()
