@@ -147,6 +147,24 @@ def test_a_check_without_the_data_says_in_one_line_what_is_missing(
             r"in the defaults list of /.*experiment/mine\.yaml.*`- override /backbone: hivt_m`, with the slash",
         ),
         (
+            "experiment/mine.yaml",
+            "# @package _global_\ndefaults: [rpi/v_lstn, _self_]",
+            "experiment=mine",
+            r"in the defaults list of /.*experiment/mine\.yaml, .*: unknown option experiment=rpi/v_lstn: .* 'rpi/v_lstm'",
+        ),
+        (
+            "experiment/mine.yaml",
+            "# @package _global_\ndefaults: [rpi/v_lstm, {override /optimizer: adan}]",
+            "experiment=mine",
+            r"in the defaults list of /.*experiment/mine\.yaml, .*: unknown option optimizer=adan",
+        ),
+        (
+            "experiment/mine.yaml",
+            "# @package _global_\ndefaults: [rpi/v_lstm, _self_]\ntitle: mine",
+            "experiment=mine backbone=v_lstn",
+            r"^unknown option backbone=v_lstn",
+        ),
+        (
             "experiment/rpi/mine.yaml",
             "# @package _global_\ndefaults: [/experiment/rpi/v_lstm, {override backbone: hivt_m}]",
             "experiment=rpi/mine",
@@ -210,7 +228,7 @@ def test_mistakes_in_files_of_the_tree_are_named(
     (tmp_path / file).parent.mkdir(parents=True)
     (tmp_path / file).write_bytes(content.encode() if isinstance(content, str) else content)
     with pytest.raises(ConfigError, match=message):
-        compose("train", [words], [str(tmp_path)])
+        compose("train", words.split(), [str(tmp_path)])
 
 
 @pytest.mark.parametrize(

@@ -42,7 +42,9 @@ def one_sentence(instance: Hydra, name: str, overrides: Sequence[str]) -> Iterat
             "a value with other than plain letters, digits and ._-/ needs quotes, \"key='value'\""
         ) from error
     except MissingConfigException as error:
-        raise ConfigError(_missing_option(instance, error.missing_cfg_file or "", str(error))) from error
+        missing = error.missing_cfg_file or ""
+        where = _place(instance, missing, overrides)
+        raise ConfigError(where + _missing_option(instance, missing, str(error))) from error
     except (HydraException, OmegaConfBaseException) as error:
         repeated = re.search(r"Multiple values for ([\w./@]+)\. .*'override [\w./@]+: (\S+)'", str(error))
         if repeated:
@@ -105,6 +107,17 @@ def _override(instance: Hydra, group: str, option: str, overrides: Sequence[str]
         f"{group} has an option already: in the defaults list of {file_of(instance, EXPERIMENTS, _chosen(overrides))}, "
         f"or of a file that it is based on, write `- override /{group}: {option}`, with the slash"
     )
+
+
+def _place(instance: Hydra, missing: str, overrides: Sequence[str]) -> str:
+    """The beginning of an error message for an option without a file: the file of the experiment, if that chooses it."""
+    option, experiment = missing.removesuffix(".yaml"), _chosen(overrides)
+    given = ("hydra", *(word.lstrip("+").partition("=")[0] for word in overrides))
+    if any(option.startswith(f"{group}/") for group in given if group != EXPERIMENTS):
+        return ""
+    if experiment not in options_of(instance, EXPERIMENTS):
+        return ""
+    return f"in the defaults list of {file_of(instance, EXPERIMENTS, experiment)}, or of a file that it is based on: "
 
 
 def _missing_option(instance: Hydra, missing: str, message: str) -> str:
