@@ -338,6 +338,25 @@ class BackendSuite:
         solution = self.damped(FeatureEnergy(ALL, bounds=BOUNDS), scene, parameters, steps=0)
         assert solution.status.tolist() == [[0, 0], [Status.STOPPED] * 2]
 
+    @pytest.mark.parametrize(
+        ("own", "pair", "kind"),
+        [
+            (("acc", "turnr", "steer"), (), "length"),
+            (("acc", "turnr"), ("circles",), "width"),
+            (("acc", "turnr"), ("clearance",), "margin"),
+        ],
+    )
+    def test_sizes_and_margins_that_are_no_numbers_stop_their_sample(self, own, pair, kind):
+        scene = random_scene(3, 2, history=2)
+        scene.history[:, 1, :, 0] += 100.0  # the agents do not meet
+        parameters = random_game(scene, own=own, pair=pair)
+        if kind == "margin":
+            parameters.margins["clearance"][1] = torch.nan
+        else:
+            scene.size[1, 0, 0 if kind == "length" else 1] = torch.nan
+        solution = self.damped(FeatureEnergy(own, pair), scene, parameters)
+        assert solution.status.tolist() == [[0, 0], [Status.STOPPED] * 2, [0, 0]]
+
     def test_stiff_rates_are_accurate_in_single_precision(self):
         scene, own = random_scene(8, 2, history=2, size=1.0), ("goal", "acc", "turnr", "jerk")
         parameters = random_game(scene, 1, 40, own=own, spread=0.2)
