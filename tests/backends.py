@@ -354,8 +354,9 @@ class BackendSuite:
             parameters.margins["clearance"][1] = torch.nan
         else:
             scene.size[1, 0, 0 if kind == "length" else 1] = torch.nan
-        solution = self.damped(FeatureEnergy(own, pair), scene, parameters)
-        assert solution.status.tolist() == [[0, 0], [Status.STOPPED] * 2, [0, 0]]
+        for steps in (0, 2):
+            solution = self.damped(FeatureEnergy(own, pair), scene, parameters, steps)
+            assert solution.status.tolist() == [[0, 0], [Status.STOPPED] * 2, [0, 0]], steps
 
     def test_stiff_rates_are_accurate_in_single_precision(self):
         scene, own = random_scene(8, 2, history=2, size=1.0), ("goal", "acc", "turnr", "jerk")
