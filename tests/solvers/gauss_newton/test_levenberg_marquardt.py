@@ -290,6 +290,23 @@ def test_adaptive_steps_never_raise_the_energy_of_any_sample():
         assert torch.equal(alone.controls[0], solution.controls[index])
 
 
+@pytest.mark.parametrize("backend", ["compiled", "pytorch"])
+def test_adaptive_damping_stays_in_its_range(backend):
+    scene, own = random_scene(4, 2, history=2, size=0.01, dtype=torch.float64), ("goal", "acc", "turnr")
+    energy, game = FeatureEnergy(own), random_game(scene, 2, 8, own=own)
+    game.own_weights["goal"].fill_(0.05)
+    solve = LevenbergMarquardt(step_size=1.0, adaptive=True, backend=backend)
+    with torch.no_grad():
+        found, damping = solve.run(energy, scene, game, 1, torch.full((4, 2), 1e-7, dtype=torch.float64))
+        assert (found.energy < found.initial_energy).all()
+        assert (damping == 1e-7).all(), "an accepted step divides it by ten, down to this"
+        game = dataclasses.replace(game, initial_controls=torch.zeros_like(game.initial_controls))
+        for weight in game.own_weights.values():
+            weight.fill_(0.0)
+        _, damping = solve.run(energy, scene, game, 1, torch.full((4, 2), 1e3, dtype=torch.float64))
+        assert (damping == 1e4).all(), "a step that changes nothing multiplies it by ten"
+
+
 def test_adaptive_gradients_equal_central_differences():
     scene = random_scene(2, 2, history=2, size=2.0, dtype=torch.float64)
     parameters = random_game(scene, 1, 5, spread=2.0)
