@@ -159,6 +159,24 @@ def test_a_check_without_the_data_says_in_one_line_what_is_missing(
             r"in the defaults list of /.*experiment/mine\.yaml, .*: unknown option optimizer=adan",
         ),
         (
+            "budget/mine.yaml",
+            "# @package _global_\ndefaults: [smoke, {override /optimizer: adan}]",
+            "experiment=rpi/v_lstm budget=mine",
+            r"in the defaults list of /.*budget/mine\.yaml, .*: unknown option optimizer=adan",
+        ),
+        (
+            "sweeps/mine.yaml",
+            "# @package _global_\ndefaults: [{override /hydra/launcher: lokal}]",
+            "sweeps=mine experiment=rpi/v_lstm",
+            r"in the defaults list of /.*sweeps/mine\.yaml, .*: unknown option hydra/launcher=lokal",
+        ),
+        (
+            "data/mine.yaml",
+            "defaults: [rpj, _self_]",
+            "experiment=rpi/v_lstm data='mine'",
+            r"in the defaults list of /.*data/mine\.yaml, .*: unknown option data=rpj",
+        ),
+        (
             "experiment/mine.yaml",
             "# @package _global_\ndefaults: [rpi/v_lstm, _self_]\ntitle: mine",
             "experiment=mine backbone=v_lstn",

@@ -43,7 +43,7 @@ def one_sentence(instance: Hydra, name: str, overrides: Sequence[str]) -> Iterat
         ) from error
     except MissingConfigException as error:
         missing = error.missing_cfg_file or ""
-        where = _place(instance, missing, overrides)
+        where = _place(instance, name, missing, overrides)
         raise ConfigError(where + _missing_option(instance, missing, str(error))) from error
     except (HydraException, OmegaConfBaseException) as error:
         repeated = re.search(r"Multiple values for ([\w./@]+)\. .*'override [\w./@]+: (\S+)'", str(error))
@@ -109,15 +109,30 @@ def _override(instance: Hydra, group: str, option: str, overrides: Sequence[str]
     )
 
 
-def _place(instance: Hydra, missing: str, overrides: Sequence[str]) -> str:
-    """The beginning of an error message for an option without a file: the file of the experiment, if that chooses it."""
-    option, experiment = missing.removesuffix(".yaml"), _chosen(overrides)
-    given = ("hydra", *(word.lstrip("+").partition("=")[0] for word in overrides))
-    if any(option.startswith(f"{group}/") for group in given if group != EXPERIMENTS):
+def _place(instance: Hydra, name: str, missing: str, overrides: Sequence[str]) -> str:
+    """The beginning of an error message for an option without a file: the chosen file whose defaults list has the option.
+
+    It is empty where no chosen file is the cause alone, as for a misspelt option on the command line, and for an option of a
+    package that is not installed, which is no mistake in a file.
+    """
+    from hydra.errors import HydraException, MissingConfigException
+    from hydra.types import RunMode
+
+    if missing.removesuffix(".yaml") in PLUGINS:
         return ""
-    if experiment not in options_of(instance, EXPERIMENTS):
-        return ""
-    return f"in the defaults list of {file_of(instance, EXPERIMENTS, experiment)}, or of a file that it is based on: "
+    for word in overrides:
+        group, _, value = word.lstrip("+").partition("=")
+        option = value.strip("'\"")
+        if option not in options_of(instance, group):
+            continue
+        try:
+            instance.config_loader.compute_defaults_list(name, overrides=[word], run_mode=RunMode.RUN)
+        except MissingConfigException as error:
+            if error.missing_cfg_file == missing:
+                return f"in the defaults list of {file_of(instance, group, option)}, or of a file that it is based on: "
+        except HydraException:  # the choice needs others
+            continue
+    return ""
 
 
 def _missing_option(instance: Hydra, missing: str, message: str) -> str:
