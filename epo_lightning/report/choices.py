@@ -12,16 +12,15 @@ from typing import Any
 import yaml
 
 from epo_lightning.registry import ConfigError
-from epo_lightning.report.labels import value_text
-from epo_lightning.report.selection import BestSetting
+from epo_lightning.report.selection import SEARCHED, BestSetting
 
 HEADER = """\
 # The best settings of a search, chosen on the validation split, with the scores of all runs that were compared. Written by
 #   {command}
 # A sweep that trains its rows with them:  epo sweep <name> choices=<this file>
 """
-OVERRIDE = re.compile(r"(goal|[a-z_]+(\.\w+)+)=.+", re.DOTALL)
-"""An override of one setting: ``optimizer.lr=0.0005``."""
+OVERRIDE = re.compile(rf"\+{{0,2}}(goal|{'|'.join(SEARCHED)}|[a-z_]+(\.\w+)+)=.+", re.DOTALL)
+"""An override of one setting, or an option of a part that is searched: ``optimizer.lr=0.0005``, ``backbone=vibes``."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,7 @@ def choices_to_yaml(best: Sequence[BestSetting], command: str) -> str:
     counts = Counter(entry.experiment for entry in best)
     content = {
         entry.experiment: {
-            "overrides": [f"{key}={value_text(value)}" for key, value in entry.settings.items()],
+            "overrides": list(entry.overrides),
             "metric": entry.metric,
             "split": "val",
             "data": entry.row.runs[0].data,
@@ -111,7 +110,7 @@ def read_choices(file: str) -> Choices:
                     f"choices={file}: {experiment} has the override {word!r}, expected a setting of a section, such as "
                     "optimizer.lr=0.0005"
                 )
-            key = word.partition("=")[0]
+            key = word.partition("=")[0].lstrip("+")
             if key in values:
                 raise ConfigError(
                     f"choices={file}: {experiment} sets {key} twice, by {values[key]} and by {word}: leave one of them out"

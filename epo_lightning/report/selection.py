@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 from epo_lightning.registry import ConfigError
-from epo_lightning.report.labels import natural, word
+from epo_lightning.report.labels import natural, value_text
 from epo_lightning.report.rows import BATCH, Row, plain_rows, require_comparable, setting
 from epo_lightning.report.runs import EvaluatedRun
 
 SEARCHED = ("optimizer", "backbone", "forecaster")
 """Sections whose settings are searched for the best value, like :data:`BATCH`; others are varied for comparison."""
+FROZEN = "forecaster.frozen"
+"""Path of the run that a refinement refines: another one for every seed, so that it belongs to no setting."""
 
 
 @dataclass(frozen=True)
@@ -24,15 +25,15 @@ class BestSetting:
     Attributes:
         row: runs and scores of the setting.
         metric: metric on the validation split that chose it.
-        settings: its values by dotted key, of the searched settings and of those that the command of the search fixed.
-        words: overrides that train with it: ``experiment=rpi/v_lstm optimizer.lr=0.0005``.
+        overrides: those of its searched settings, and of options and settings that the command of the search fixed.
+        words: words of a command line that train with it: ``experiment=rpi/v_lstm optimizer.lr=0.0005``.
         compared: runs and scores of all settings compared, the best one included.
         left_out: labels of settings that lack seeds or have no finite score.
     """
 
     row: Row
     metric: str
-    settings: Mapping[str, Any]
+    overrides: tuple[str, ...]
     words: str
     compared: tuple[Row, ...]
     left_out: tuple[str, ...]
@@ -96,19 +97,44 @@ def _best(runs: list[EvaluatedRun], rows: list[Row], metric: str) -> BestSetting
         )
     best = min(whole, key=lambda row: (row.cells[metric].mean, natural(row.settings)))
     left_out = tuple(row.name for row in rows if row not in whole)
-    settings = dict(sorted({**_fixed(best.runs[0]), **best.settings}.items()))
-    return BestSetting(best, metric, settings, _words(best.runs[0], settings), tuple(whole), left_out)
+    overrides = _overrides(best)
+    words = " ".join(shlex.quote(word) for word in (*_row(best.runs[0], overrides), *overrides))
+    return BestSetting(best, metric, overrides, words, tuple(whole), left_out)
 
 
-def _fixed(run: EvaluatedRun) -> dict[str, Any]:
-    """The settings of :data:`SEARCHED` sections that the command of a run gives: a search may fix some for all runs."""
-    keys = (word.lstrip("+").partition("=")[0] for word in shlex.split(run.command))
-    return {key: setting(run.config, key) for key in sorted({*keys}) if "." in key and _is_searched(key)}
+def _overrides(row: Row) -> tuple[str, ...]:
+    """Overrides for the settings of a row, and those of :data:`SEARCHED` sections in its command.
+
+    A search may fix some settings for all of its runs, and may choose other options of these groups than the experiment.
+
+    Raises:
+        ConfigError: the recorded command is no command line.
+    """
+    run = row.runs[0]
+    try:
+        given = [word.partition("=") for word in shlex.split(run.command)]
+    except ValueError as error:
+        raise ConfigError(
+            f"{run.path / 'run.json'}: command cannot be read ({error}): was it edited? Restore the file from a copy"
+        ) from error
+    texts, pluses = dict[str, str](), dict[str, str]()
+    for start, _, value in given:
+        key = start.lstrip("+")
+        pluses[key] = start.removesuffix(key)  # of a setting that the chosen file leaves at its default
+        if _is_searched(key):
+            texts[key] = value_text(setting(run.config, key)) if "." in key else value
+    texts |= {key: value_text(value) for key, value in row.settings.items()}
+    texts.pop(FROZEN, None)
+    return tuple(f"{pluses.get(key, '')}{key}={text}" for key, text in sorted(texts.items()))
 
 
-def _words(run: EvaluatedRun, settings: Mapping[str, Any]) -> str:
-    parts = [f"data={run.data}", f"backbone={run.backbone}", f"forecaster={run.forecaster}"]
-    chosen = [f"experiment={run.experiment}"] if run.experiment else parts
-    if run.experiment and run.config["data"].get("split") == "hard":
-        chosen += [f"data={run.data}"]
-    return " ".join([*chosen, *(word(key, value) for key, value in settings.items())])
+def _row(run: EvaluatedRun, overrides: Iterable[str]) -> list[str]:
+    """Overrides that choose the row of a run: its experiment or, without one, the parts that no other override chooses."""
+    if not run.experiment:
+        parts = {"data": run.data, "backbone": run.backbone, "forecaster": run.forecaster}
+        chosen = {override.partition("=")[0] for override in overrides}
+        return [f"{group}={option}" for group, option in parts.items() if group not in chosen]
+    return [
+        f"experiment={run.experiment}",
+        *([f"data={run.data}"] if run.config["data"].get("split") == "hard" else []),
+    ]

@@ -45,7 +45,7 @@ def test_the_lowest_mean_over_seeds_wins(tmp_path: Path) -> None:
     search(tmp_path, {(0.001, 64): [0.5, 0.5], (0.001, 128): [0.3, 0.3]}, title="V-LSTM + SC")
     plain, sc = best(tmp_path)
     assert plain.words == "experiment=rpi/v_lstm backbone.width=64 optimizer.lr=0.0005"
-    assert plain.settings == {"backbone.width": 64, "optimizer.lr": 0.0005}
+    assert plain.overrides == ("backbone.width=64", "optimizer.lr=0.0005")
     assert plain.row.cells["minSADE"].mean == pytest.approx(0.20)
     assert (plain.row.cells["minSADE"].n, plain.candidates, plain.left_out) == (2, 3, ())
     assert sc.words == "experiment=rpi/v_lstm_sc backbone.width=128"
@@ -63,7 +63,7 @@ def test_test_scores_are_ignored(tmp_path: Path) -> None:
     search(tmp_path, {(0.001, 64): [0.1], (0.0005, 64): [0.9]}, split="test")
     search(tmp_path, {(0.001, 64): [0.4], (0.0005, 64): [0.3]})
     (found,) = best(tmp_path)
-    assert found.settings == {"optimizer.lr": 0.0005}
+    assert found.overrides == ("optimizer.lr=0.0005",)
 
 
 def test_a_lucky_seed_and_a_failed_training_do_not_win(tmp_path: Path) -> None:
@@ -126,7 +126,7 @@ def test_settings_varied_for_comparison_are_not_selected(tmp_path: Path, key: st
 
 def test_settings_that_a_search_fixes_belong_to_the_best_setting(tmp_path: Path) -> None:
     fixed = (
-        "backbone.width=64 data.batch_size=16 +optimizer.clip=0.5 data.placements=8 solver.steps=4 forecaster.modes=3"
+        "backbone.width=64 data.batch_size=16 ++optimizer.clip=0.5 data.placements=8 solver.steps=4 forecaster.modes=3"
     )
     for lr, value in ((0.001, 0.3), (0.002, 0.2)):
         make_run(
@@ -135,6 +135,39 @@ def test_settings_that_a_search_fixes_belong_to_the_best_setting(tmp_path: Path)
             command=f"epo train experiment=rpi/v_lstm optimizer.lr={lr} {fixed} budget=short seed=0",
         )  # fmt: skip
     (found,) = best(tmp_path)
-    chosen = "backbone.width=64 data.batch_size=16 optimizer.clip=0.5 optimizer.lr=0.002"
+    chosen = "backbone.width=64 data.batch_size=16 ++optimizer.clip=0.5 optimizer.lr=0.002"
     assert found.words == f"experiment=rpi/v_lstm {chosen}"
-    assert [f"{key}={value}" for key, value in found.settings.items()] == chosen.split()
+    assert found.overrides == tuple(chosen.split())
+
+
+def searched(folder: Path, words: str, experiment: str | None = "rpi/v_lstm", **settings: object) -> None:
+    """Two runs of a search over the learning rate, whose command has further words."""
+    for lr, value in ((0.001, 0.3), (0.002, 0.2)):
+        make_run(
+            folder / str(lr), "V-LSTM", "marginal", scores(value), split="val", experiment=experiment,
+            settings={"optimizer.lr": lr, **settings}, command=f"epo train {words} optimizer.lr={lr}",
+        )  # fmt: skip
+
+
+def test_other_parts_that_a_search_fixes_belong_to_the_best_setting(tmp_path: Path) -> None:
+    searched(tmp_path, "experiment=rpi/v_lstm backbone=wide +forecaster.annealing=0.5", **{"forecaster.annealing": 0.5})
+    (found,) = best(tmp_path)
+    assert found.words == "experiment=rpi/v_lstm backbone=wide +forecaster.annealing=0.5 optimizer.lr=0.002"
+
+
+def test_parts_without_an_experiment_are_named_once(tmp_path: Path) -> None:
+    searched(tmp_path, "backbone=wide forecaster=marginal", None)
+    (found,) = best(tmp_path)
+    assert found.words == "data=rpi backbone=wide forecaster=marginal optimizer.lr=0.002"
+
+
+def test_the_frozen_run_of_one_seed_belongs_to_no_setting(tmp_path: Path) -> None:
+    searched(tmp_path, "experiment=rpi/v_lstm forecaster.frozen=runs/s0", **{"forecaster.frozen": "runs/s0"})
+    (found,) = best(tmp_path)
+    assert found.words == "experiment=rpi/v_lstm optimizer.lr=0.002"
+
+
+def test_a_damaged_command_is_named_with_its_file(tmp_path: Path) -> None:
+    searched(tmp_path, "experiment=rpi/v_lstm 'title=x")
+    with pytest.raises(ConfigError, match=r"0\.002/run\.json: command cannot be read \(No closing quotation\)"):
+        best(tmp_path)

@@ -254,7 +254,7 @@ def _with_choices(listed: Sequence[list[str]], choices: Choices, extra: Sequence
         values = {key.lstrip("+~"): value for key, _, value in (given.partition("=") for given in overrides)}
         experiment = values.get("experiment", "")
         chosen = choices.overrides.get(experiment, ())
-        for key in (override.partition("=")[0] for override in chosen):
+        for key in (override.partition("=")[0].lstrip("+") for override in chosen):
             if key in values:
                 raise ConfigError(
                     f"{key} of {experiment} is set by {file} and by the sweep or its command: leave one out"

@@ -58,24 +58,29 @@ def test_a_sweep_starts_its_rows_with_the_choices(
     epo: Epo, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     content = {
-        "rpi/v_lstm": {"overrides": ["optimizer.lr=0.002", "backbone.width=16"], "runs": ["runs/a"]},
+        "rpi/v_lstm": {
+            "overrides": ["optimizer.lr=0.002", "backbone=vibes", "backbone.width=16", "+forecaster.annealing=0.5"],
+            "runs": ["runs/a"],
+        },
         "rpi/v_lstm_sc": {"overrides": ["optimizer.lr=0.003"]},
     }
     Path("choices.yaml").write_text(yaml.safe_dump(content))
-    started: dict[str, tuple[float, int]] = {}
+    started: dict[str, tuple[float, int, str, float]] = {}
     monkeypatch.setattr(RPIData, "setup", lambda self, stage: None)  # nothing is trained here
 
     def task(config: DictConfig) -> None:
-        started[config.title] = config.optimizer.lr, config.backbone.width
+        annealing = config.forecaster.get("annealing", 0.0)
+        started[config.title] = config.optimizer.lr, config.backbone.width, config.backbone.name, annealing
 
     words = [*MAIN[2:], "choices=choices.yaml"]
     assert not sweeping.run("rpi_main", words, [str(tiny.CONF)], task, False), "no run was trained"
     out = capsys.readouterr().out
-    assert "choices=choices.yaml: rpi/v_lstm: optimizer.lr=0.002 backbone.width=16" in out
+    assert "choices=choices.yaml: rpi/v_lstm: optimizer.lr=0.002 backbone=vibes backbone.width=16" in out
     assert "choices=choices.yaml: rpi/v_lstm_sc: not in this sweep" in out
-    assert started.pop("V-LSTM") == (0.002, 16)
-    assert len(started) == 1, "the other row is started without choices"
-    assert (0.002, 16) not in started.values()
+    assert started.pop("V-LSTM") == (0.002, 16, "vibes", 0.5)
+    (other,) = started.values()  # it is started without choices
+    assert other[2:] == ("v_lstm", 0.0)
+    assert other[:2] != (0.002, 16)
     sweep = Sweep.find("rpi_main", words, "runs")
     assert sweep.record["choices"] == content
     assert sweep.label != "rpi_main"
@@ -91,6 +96,7 @@ def test_a_sweep_starts_its_rows_with_the_choices(
         ("rpi/v_lstm: {overrides: [optimizer.learning=0.1]}", "choices=c.yaml, rpi/v_lstm: .*learning"),
         ("rpi/v_lstm_sc: {overrides: [optimizer.lr=0.1]}", "no experiment of this sweep, only rpi/v_lstm_sc"),
         ("rpi/v_lstm: {overrides: [optimizer.schedule=cosine]}", "optimizer.schedule of rpi/v_lstm is set by"),
+        ("rpi/v_lstm: {overrides: [++optimizer.schedule=cosine]}", "optimizer.schedule of rpi/v_lstm is set by"),
     ],
 )
 def test_choices_that_do_not_fit_are_refused(epo: Epo, refused: Callable[..., str], text: str, message: str) -> None:
@@ -104,7 +110,9 @@ def test_choices_that_do_not_fit_are_refused(epo: Epo, refused: Callable[..., st
     ("text", "message"),
     [
         ("rpi/v_lstm: {overrides: [seed=4]}", "'seed=4', expected a setting of a section"),
-        ("rpi/v_lstm: {overrides: [+optimizer.new=4]}", "expected a setting of a section"),
+        ("rpi/v_lstm: {overrides: [~optimizer.lr=4]}", "expected a setting of a section"),
+        ("rpi/v_lstm: {overrides: [data=exid]}", "expected a setting of a section"),
+        ("rpi/v_lstm: {overrides: [optimizer.clip=1, ++optimizer.clip=2]}", r"v_lstm sets optimizer\.clip twice"),
         ("rpi/v_lstm: {lr: 4}", "rpi/v_lstm has no list `overrides`"),
         (
             "rpi/v_lstm: {overrides: [optimizer.lr=0.1]}\nrpi/v_lstm: {overrides: [optimizer.lr=0.2]}",
