@@ -83,7 +83,7 @@ class NextEpoch(Callback):
         loop.epoch_loop.restarting = False
 
 
-# The two classes below have the names of Lightning's classes, because checkpoints store callback states under these names.
+# ModelCheckpoint and EarlyStopping have the names of Lightning's classes: checkpoints store callback states under them.
 
 
 class ModelCheckpoint(of_lightning.ModelCheckpoint):
@@ -117,6 +117,18 @@ class LastCheckpoint(ModelCheckpoint):
             folder, filename="ended", save_on_train_epoch_end=True, every_n_epochs=1, enable_version_counter=False
         )
         self._ended, self._last = folder / "ended.ckpt", folder / "last.ckpt"
+
+    @property
+    def state_key(self) -> str:
+        """That of a :class:`ModelCheckpoint`, as in runs of earlier versions: there, Lightning warns of any other."""
+        return super().state_key.replace(type(self).__name__, ModelCheckpoint.__name__, 1)
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Reads nothing: all paths are known.
+
+        Earlier versions stored ``last.ckpt`` as the path of their latest file. Lightning would delete it before the new one
+        has its name, in a run folder that is reached through a link.
+        """
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if trainer.is_global_zero:

@@ -104,6 +104,32 @@ def test_a_run_that_is_stopped_at_the_end_of_an_epoch_logs_every_epoch_once(epo:
     assert sorted(path.name for path in Path("parts/checkpoints").iterdir()) == ["best.ckpt", "last.ckpt"]
 
 
+def test_a_run_of_an_earlier_version_continues_and_keeps_its_checkpoint_until_the_next_row_is_logged(
+    epo: Epo, recwarn: pytest.WarningsRecorder
+) -> None:
+    begin_and_stop(epo, "begun", 2)
+    file = Path("begun/checkpoints/last.ckpt")
+    content = torch.load(file, weights_only=True)
+    states = content["callbacks"]
+    (state,) = (entry for key, entry in states.items() if "Checkpoint{'monitor': None" in key)
+    for key in [key for key, entry in states.items() if entry is state]:
+        states["ModelCheckpoint" + key[key.index("{") :]] = states.pop(key)
+    state["best_model_path"] = str(file.resolve())
+    torch.save(content, file)
+    Path("linked").symlink_to("begun")
+
+    def stop(self: CSVLog, metrics: Mapping[str, float], step: int | None = None) -> None:
+        if "train/loss" in metrics:
+            raise RuntimeError("power failure")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(CSVLog, "log_metrics", stop)
+        with pytest.raises(RuntimeError, match="power failure"):
+            epo("train", "resume=linked")
+    assert torch.load(file, weights_only=True)["epoch"] == 0
+    assert not [entry for entry in recwarn if "callbacks used to create the checkpoint" in str(entry.message)]
+
+
 def test_a_run_that_had_stopped_early_makes_no_further_step(epo: Epo) -> None:
     words = (*without("trainer.max_epochs"), "callbacks.patience=1", "trainer.max_epochs=9")
     assert epo(*words, "run_dir=whole") == 0
