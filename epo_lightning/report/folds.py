@@ -9,12 +9,10 @@ from __future__ import annotations
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 from epo_lightning.identity import row_identity
 from epo_lightning.report.runs import EvaluatedRun
-
-FOLD = "data.test"
-"""The setting in which the folds of a data set differ."""
 
 
 def named_by_fold(runs: Iterable[EvaluatedRun]) -> list[EvaluatedRun]:
@@ -22,13 +20,13 @@ def named_by_fold(runs: Iterable[EvaluatedRun]) -> list[EvaluatedRun]:
     runs = list(runs)
     folds: dict[str, set[str]] = {}
     for run in runs:
-        folds.setdefault(run.data, set()).add(_ending(run))
-    return [replace(run, data=run.data + _ending(run)) if len(folds[run.data]) > 1 else run for run in runs]
+        folds.setdefault(run.data, set()).add(fold(run.config))
+    return [replace(run, data=run.data + fold(run.config)) if len(folds[run.data]) > 1 else run for run in runs]
 
 
 def whole_data(run: EvaluatedRun) -> str:
     """Name of the data set of which a run named by :func:`named_by_fold` is a fold; empty for all other runs."""
-    ending = _ending(run)
+    ending = fold(run.config)
     return run.data.removesuffix(ending) if ending and run.data.endswith(ending) else ""
 
 
@@ -44,13 +42,15 @@ def joined(runs: Sequence[EvaluatedRun]) -> list[EvaluatedRun]:
     Returns:
         the runs; none if there are fewer than two folds, or if folds have groups in common.
     """
-    folds = sorted({_groups(run) for run in runs})
+    folds = sorted({_groups(run.config) for run in runs})
     groups = [group for fold in folds for group in fold]
     if len(folds) < 2 or len({*groups}) < len(groups):
         return []
     rows: dict[str, dict[int, list[EvaluatedRun]]] = {}
     for run in runs:
-        rows.setdefault(row_identity(_without_test(run), ""), {}).setdefault(folds.index(_groups(run)), []).append(run)
+        rows.setdefault(row_identity(_without_test(run), ""), {}).setdefault(
+            folds.index(_groups(run.config)), []
+        ).append(run)
     digests = ", ".join(sorted({run.data_digest for run in runs}))
     found = []
     for row, members in rows.items():
@@ -78,14 +78,15 @@ def mean_scores(scores: Iterable[Mapping[str, float]]) -> dict[str, float]:
     return {key: statistics.fmean(each[key] for each in scores) for key in known}
 
 
-def _groups(run: EvaluatedRun) -> tuple[str, ...]:
-    """The groups of the test split that a run's configuration names, in one order; empty if the split is drawn."""
-    named = run.config["data"].get("test")
+def fold(config: Mapping[str, Any]) -> str:
+    """Ending of a data set's name for the groups of the test split in a configuration; empty if the split is drawn."""
+    return f", test {', '.join(_groups(config))}" if _groups(config) else ""
+
+
+def _groups(config: Mapping[str, Any]) -> tuple[str, ...]:
+    """The groups of the test split that a configuration names, in one order; empty if the split is drawn."""
+    named = config["data"].get("test")
     return tuple(sorted({*map(str, named)})) if isinstance(named, list | tuple) else ()
-
-
-def _ending(run: EvaluatedRun) -> str:
-    return f", test {', '.join(_groups(run))}" if _groups(run) else ""
 
 
 def _without_test(run: EvaluatedRun) -> Mapping[str, object]:

@@ -18,6 +18,8 @@ from epo_lightning.run_folder import FINISHED, OTHER, RunFolder, discover
 
 _ABOUT = {"agents": NUMBERS_BY_NAME, "notes": TEXTS}
 """Entries on the scenes of other data, which older files lack."""
+UNLEARNED = "constant_velocity"
+"""The forecaster that learns nothing."""
 TRAIN = "train one first, epo train experiment=rpi/v_lstm_epo"
 COPY = "copy the run folder again from where it was made, or move it away"
 
@@ -78,7 +80,7 @@ class EvaluatedRun:
     @property
     def learned(self) -> bool:
         """Whether the forecaster was trained; constant velocity has neither a budget nor training data."""
-        return self.forecaster != "constant_velocity"
+        return self.forecaster != UNLEARNED
 
 
 def find_runs(folder: str | Path) -> list[RunFolder]:

@@ -25,9 +25,10 @@ from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.report.choices import Choices, read_choices
 from epo_lightning.report.entries import TEXT, WHOLE, check_entries
-from epo_lightning.report.folds import FOLD
+from epo_lightning.report.folds import fold
 from epo_lightning.report.labels import value_text, word
 from epo_lightning.report.rows import unequal_conditions
+from epo_lightning.report.runs import UNLEARNED
 from epo_lightning.run_folder import RunFolder, numbered, read_json
 from epo_lightning.schema import read
 
@@ -214,8 +215,8 @@ def _listed(sweep: Sweep, words: Sequence[str], extra: Sequence[str], choices: C
         if data not in ready and sweep.state(job) != "done":
             assembly.build_data(config["data"]).setup("fit")
             ready.add(data)
-        if {*job.measures} - {"time"}:
-            scored.setdefault(job.data, []).append(config)
+        if {*job.measures} - {"time"} and config["forecaster"]["name"] != UNLEARNED:
+            scored.setdefault(job.data + fold(config), []).append(config)
         jobs.setdefault(job.run.path, job)
     for data, configs in scored.items():
         _refuse_incomparable(data, configs)
@@ -223,12 +224,9 @@ def _listed(sweep: Sweep, words: Sequence[str], extra: Sequence[str], choices: C
 
 
 def _refuse_incomparable(data: str, configs: Sequence[Mapping[str, Any]]) -> None:
-    """Refuse scored runs on one data set that differ in conditions which must be equal for all rows of a table.
-
-    Folds are no such runs: they have different test groups, and tables of their own.
-    """
+    """Refuse trainings on one data set, or one fold, that differ in conditions which all rows of a table must share."""
     budgets = {str(config["budget"]["name"]): "" for config in configs}
-    keys = ["budget"] if len(budgets) > 1 else [key for key in unequal_conditions(configs) if key != FOLD]
+    keys = ["budget"] if len(budgets) > 1 else unequal_conditions(configs)
     if keys:
         raise ConfigError(
             f"the runs of this sweep on {data} differ in {', '.join(keys)}, which must be equal for all rows of a table, so "

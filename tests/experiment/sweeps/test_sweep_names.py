@@ -12,6 +12,7 @@ import pytest
 from experiment.conftest import TINY, Epo
 from experiment.sweeps.rpi_sweep import SRC, the_sweep
 
+from epo_lightning.data.recorded.recordings import RecordedData
 from epo_lightning.experiment.config.compose import compose, jobs
 from epo_lightning.experiment.sweeps.sweep import Job, Sweep, label
 from epo_lightning.experiment.sweeps.sweeping import _listed
@@ -255,3 +256,28 @@ def test_settings_that_a_table_compares_and_times_are_not_refused(tmp_path: Path
     for more in (["data.batch_size=8,16", "optimizer.lr=0.1,0.2"], ["score=time", "data.scenes=32,64"]):
         listed = _listed(Sweep(tmp_path / "runs" / "sweeps" / "a"), ["sweeps=rpi_main", "score=val", *words, *more], [])
         assert len(listed) == (4 if "score=time" not in more else 2)
+
+
+def test_rows_that_learn_nothing_and_folds_need_not_share_the_conditions_of_trainings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = tmp_path / "own" / "experiment"
+    own.mkdir(parents=True)
+    files = {
+        "still": "defaults: [rpi/const_vel, _self_]\ntrainer: {precision: 64-true}",
+        "fold0": "defaults: [highway/v_lstm, _self_]\ndata: {test: ['0'], val_share: 0.2}",
+        "fold1": "defaults: [highway/v_lstm, _self_]\ndata: {test: ['1'], val_share: 0.3}",
+        "other": "defaults: [highway/v_lstm, _self_]\ndata: {test: ['1'], val_share: 0.4}",
+    }
+    for name, content in files.items():
+        (own / f"{name}.yaml").write_text(f"# @package _global_\n{content}\n")
+    monkeypatch.setattr(RecordedData, "setup", lambda self, stage: None)  # nothing is trained here
+
+    def listed(*words: str) -> int:
+        sweep, fixed = Sweep(tmp_path / "runs" / "sweeps" / "a"), ["sweeps=rpi_main", "score=test", "seed=0"]
+        return len(_listed(sweep, [*fixed, "budget=smoke", *words], [str(own.parent)]))
+
+    assert listed("experiment=still,rpi/v_lstm", "data=drawn", "data.like=rpi") == 2
+    assert listed("experiment=fold0,fold1", "data=highway_sim") == 2
+    with pytest.raises(ConfigError, match=r"on highway_sim, test 1 differ in data\.val_share"):
+        listed("experiment=fold0,fold1,other", "data=highway_sim")
