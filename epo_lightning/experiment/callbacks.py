@@ -135,14 +135,10 @@ class LastCheckpoint(ModelCheckpoint):
             self._ended.unlink(missing_ok=True)  # of a run that was stopped before the row
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._name_last(trainer)
-
-    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._name_last(trainer)
-
-    def _name_last(self, trainer: Trainer) -> None:
         if trainer.is_global_zero and self._ended.is_file():
             self._ended.replace(self._last)
+
+    on_train_end = on_train_epoch_start
 
 
 class EarlyStopping(of_lightning.EarlyStopping):
