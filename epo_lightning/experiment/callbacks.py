@@ -120,7 +120,7 @@ class LastCheckpoint(ModelCheckpoint):
 
     @property
     def state_key(self) -> str:
-        """That of a :class:`ModelCheckpoint`, as in runs of earlier versions: there, Lightning warns of any other."""
+        """Key of a :class:`ModelCheckpoint`, as in runs of earlier versions: there, Lightning warns of any other key."""
         return super().state_key.replace(type(self).__name__, ModelCheckpoint.__name__, 1)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:

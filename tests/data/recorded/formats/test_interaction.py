@@ -42,9 +42,8 @@ def check(recording: Recording, folder: Path, label: str = "") -> None:
     tracks = recording.tracks
     assert len(tracks) == len(expected), label
     ids = tracks.ids[tracks.agent]
-    order = np.lexsort(
-        (tracks.frame, ids)
-    )  # agents of the second table follow those of the first one, whatever their ids
+    # Agents of the second table follow those of the first one, whatever their ids.
+    order = np.lexsort((tracks.frame, ids))
     np.testing.assert_array_equal(ids[order], expected[:, 0], label)
     np.testing.assert_array_equal(tracks.frame[order], expected[:, 1], label)
     np.testing.assert_array_equal(tracks.position[order], expected[:, 2:4], label)
