@@ -92,7 +92,7 @@ class Draw:
         horizon = self.horizon if self.agents <= 3 else min(self.horizon, 12)  # the reference is dense
         bounds = BOUNDS if self.bounded else dict.fromkeys(BOUNDS, (-99.0, 99.0))
         scene = random_scene(2, self.agents, history=2, size=self.size, dtype=torch.float64)
-        scene.size[..., 1] *= 0.4
+        scene.size.mul_(0.3 + torch.rand_like(scene.size))  # all sizes differ, and some are wider than long
         mask = torch.ones(2, self.agents, dtype=torch.bool)
         mask[1, self.absent : self.absent + 2] = False
         ends = None if self.ends is None else torch.tensor([min(end, horizon) for end in self.ends])

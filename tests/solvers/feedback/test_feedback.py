@@ -186,11 +186,12 @@ def test_more_steps_of_gmres_come_closer_to_the_derivative() -> None:
     assert missed[2] < 0.1 * missed[1]
 
 
-def test_a_scene_with_nan_is_stopped_and_has_no_gradient() -> None:
+@pytest.mark.parametrize("backend", ["auto", "pytorch"])
+def test_a_scene_with_nan_is_stopped_and_has_no_gradient(backend: str) -> None:
     scene, game = meeting(2.3, -2.6)
     scene.history[1, 0, 0, 0] = torch.nan
     leaves = leaves_of(game)
-    found = Implicit()(Feedback(), ENERGY, scene, leaves)
+    found = Implicit()(Feedback(backend=backend), ENERGY, scene, leaves)
     assert (found.status[1] == Status.STOPPED).all()
     found.states[0].sum().backward()
     for gradient in (leaves.goals.grad, leaves.pair_weights["clearance"].grad, leaves.own_weights["vel"].grad):
@@ -198,26 +199,29 @@ def test_a_scene_with_nan_is_stopped_and_has_no_gradient() -> None:
         assert (gradient[1] == 0).all()
 
 
+@pytest.mark.parametrize("backend", ["auto", "pytorch"])
 @pytest.mark.parametrize("scale", [1e-200, 1e-5, 1e200])
-def test_the_derivative_is_linear_in_the_cotangent_at_all_scales(scale: float) -> None:
+def test_the_derivative_is_linear_in_the_cotangent_at_all_scales(scale: float, backend: str) -> None:
     scene, game = meeting(2.3)
     slopes = []
     for factor in (1.0, scale):
         leaves = leaves_of(game)
-        Implicit()(Feedback(), ENERGY, scene, leaves).states.backward(factor * torch.ones(1, 2, 2, HORIZON, 4).double())
+        found = Implicit()(Feedback(backend=backend), ENERGY, scene, leaves)
+        found.states.backward(factor * torch.ones(1, 2, 2, HORIZON, 4).double())
         slopes.append(leaves.goals.grad / factor)
     torch.testing.assert_close(slopes[1], slopes[0], rtol=1e-9, atol=0)
 
 
+@pytest.mark.parametrize("backend", ["auto", "pytorch"])
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_a_cotangent_that_is_not_finite_stays_in_its_own_game(value: float) -> None:
+def test_a_cotangent_that_is_not_finite_stays_in_its_own_game(value: float, backend: str) -> None:
     scene, game = meeting(2.3, -2.6)
     slopes = []
     for other in (1.0, value):
         leaves = leaves_of(game)
         cotangent = torch.ones(2, 2, 2, HORIZON, 4, dtype=torch.double)
         cotangent[1] = other
-        Implicit()(Feedback(), ENERGY, scene, leaves).states.backward(cotangent)
+        Implicit()(Feedback(backend=backend), ENERGY, scene, leaves).states.backward(cotangent)
         slopes.append(leaves.goals.grad)
     assert torch.equal(slopes[1][0], slopes[0][0])
     assert slopes[0].isfinite().all()
@@ -255,6 +259,15 @@ def test_steps_after_the_end_of_a_game_have_no_effect() -> None:
     )
     assert torch.equal(found.status, wanted.status)
     torch.testing.assert_close(found.states[..., :HORIZON, :], wanted.states, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("backend", ["auto", "pytorch"])
+def test_controls_after_the_end_of_a_game_have_no_gradient(backend: str) -> None:
+    scene, game = meeting(2.3, -2.6)
+    leaves, ended = leaves_of(game), dataclasses.replace(scene, game_steps=torch.full((2,), HORIZON - 5))
+    Implicit()(Feedback(backend=backend), ENERGY, ended, leaves).controls[..., -5:, :].sum().backward()
+    for gradient in (leaves.goals.grad, leaves.pair_weights["clearance"].grad, leaves.own_weights["vel"].grad):
+        assert (gradient == 0).all()
 
 
 def test_a_hessian_without_second_derivatives_is_refused() -> None:

@@ -68,6 +68,17 @@ def test_iterations_are_those_of_pytorch(name: str, agents: int, ends: bool) -> 
         torch.testing.assert_close(controls, wanted, rtol=1e-7, atol=1e-7)
 
 
+@pytest.mark.parametrize("module", [kernel, iteration])
+def test_steps_are_halved_until_no_state_moves_too_far(module: ModuleType) -> None:
+    game = random_feedback_game(agents=2, ends=False)
+    game.parameters.goals.mul_(1e3)
+    start = controls_of(game)
+    found, _ = module.iterate(game, start, 1, 1e-3)
+    moved = game.one_by_one(2).change(*(game.states(controls).flatten(0, 1)[:, None] for controls in (start, found)))
+    assert (moved > 0.75).all()
+    assert (moved <= 1.5).all()  # the limit of GameInference.jl
+
+
 def gradients(module: ModuleType, game: FeedbackGame) -> list[torch.Tensor]:
     """The derivative by all parameters at controls that need not be a solution, as if they were one."""
     leaves = leaves_of(game.parameters)
