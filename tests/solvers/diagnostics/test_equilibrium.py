@@ -15,6 +15,7 @@ from scipy.optimize import minimize
 from epo_lightning.forecast import GameParameters, JointForecast
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.feature_energy import FeatureEnergy
+from epo_lightning.scene import KINDS as KINDS_OF_AGENTS
 from epo_lightning.scene import Scene
 from epo_lightning.solvers.diagnostics.equilibrium import equilibrium
 from epo_lightning.solvers.gauss_newton import backends
@@ -253,6 +254,24 @@ def test_there_is_no_report_of_games_with_hard_constraints():
     assert equilibrium(energy, scene, forecast) is None
     soft = dataclasses.replace(forecast, solution=dataclasses.replace(solution, constraints=None))
     assert equilibrium(energy, scene, soft) is not None
+
+
+def test_ends_of_games_missing_lines_and_kinds_of_agents_are_those_of_the_scene():
+    scene = dataclasses.replace(
+        random_scene(4, 2, history=2, size=1.5, dtype=torch.float64),
+        game_steps=torch.tensor([STEPS, 1, 2, STEPS]),
+        reference_mask=torch.tensor([True, False]).expand(4, 2, 2),
+        kind=torch.tensor([[KINDS_OF_AGENTS.index("car"), KINDS_OF_AGENTS.index("bicycle")]]).expand(4, 2),
+    )
+    parameters = random_game(scene, 1, STEPS)
+    energy = FeatureEnergy(
+        [*OWN, "lane", "velb"], bounds=BOUNDS | {"vel": {"bicycle": [0.0, 0.1], "default": [0.0, 2.0]}}
+    )
+    found = report(energy, scene, parameters, parameters.initial_controls)
+    torch.testing.assert_close(found.energy, energy(scene, parameters, parameters.initial_controls)[:, 0])
+    for field in ("game_steps", "reference_mask", "kind"):
+        other = dataclasses.replace(scene, **{field: getattr(scene, field).flip(-1)})
+        assert (found.energy - energy(other, parameters, parameters.initial_controls)[:, 0]).abs().max() > 1e-3
 
 
 def test_scenes_without_agents_have_zero_gaps():
