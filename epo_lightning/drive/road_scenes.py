@@ -80,7 +80,7 @@ class RoadScenes:
         most = chosen.shape[1]
         rows = np.where(chosen >= 0, np.arange(chosen.size).reshape(chosen.shape), -1)
         tables = SceneTables(
-            history=np.where(history_mask[there][..., None], past, 0.0).astype(np.float32),
+            history=past.astype(np.float32),
             history_mask=history_mask[there],
             future=np.zeros((*steps, 4), dtype=np.float32),
             future_mask=np.zeros(steps, dtype=bool),

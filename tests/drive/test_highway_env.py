@@ -60,6 +60,16 @@ def test_forecasters_are_shown_the_nearest_vehicles_alone(world: TrafficWorld) -
     assert distance[1 : WINDOWS.agents].max() <= distance[WINDOWS.agents :].max()
 
 
+def test_scenes_on_several_maps_have_the_order_of_their_episodes() -> None:
+    merge, roundabout = (highway_env_world(2, seed=1, place=place) for place in ("merge", "roundabout"))
+    merge.reset([0, 1])
+    roundabout.reset([0])
+    (first, last), (middle,) = merge.observe().history, roundabout.observe().history
+    mixed = TrafficWorld(merge.simulator)
+    mixed.rides = [merge.rides[0], roundabout.rides[0], merge.rides[1]]
+    torch.testing.assert_close(mixed.observe().history, torch.stack((first, middle, last)))
+
+
 def test_left_is_left(world: TrafficWorld) -> None:
     world.reset([0])
     lanes = world.rides[0].simulation.lanes

@@ -53,6 +53,10 @@ def test_contact_and_distance() -> None:
     turned = meeting(0.55)
     turned.outcome.states[:, 1, :, 2] = torch.pi / 4  # the corner of a box reaches further than its side
     assert [values(turned, shape)["collision"] for shape in ("disc", "box")] == [0.0, 1.0]
+    assert [values(turned, shape)["time_to_collision"] for shape in ("disc", "box")] == [SOON, 0.0]
+    gone = meeting(0.6)
+    gone.outcome.agent_mask[:, 0, 15:] = False  # the robot is at most at 1.4 m, and the agent stands at 2 m
+    assert values(gone)["distance"] == pytest.approx((0.6**2 + 0.6**2) ** 0.5)
 
 
 def test_time_to_collision_is_the_smallest_over_the_way() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -62,6 +63,66 @@ def test_scenes_are_those_of_recorded_data(recorded: tuple[RecordedScenes, RoadS
         ):
             assert torch.equal(getattr(made, name), getattr(wanted, name)), name
         assert made.future is None
+
+
+def vehicles(scenes: RecordedScenes, origin: np.ndarray) -> dict[str, np.ndarray]:
+    """The vehicles of a recorded scene, as the maker of scenes takes them."""
+    index = len(scenes) // 2
+    rows = scenes.tables["agents"][index].long()
+    rows = rows[rows >= 0]
+    history = scenes.tables["history"][rows].double().numpy()
+    history[..., :2] += origin
+    everyone = np.ones((1, len(rows)), dtype=bool)
+    columns = {name: scenes.tables[name][rows].numpy()[None] for name in ("history_mask", "size", "kind")}
+    return {"history": history[None], "agent_mask": everyone, **columns}
+
+
+def test_what_a_scene_of_vehicles_does_not_depend_on(recorded: tuple[RecordedScenes, RoadScenes, np.ndarray]) -> None:
+    scenes, make, origin = recorded
+    given = vehicles(scenes, origin)
+    plain = make(**given)
+    turned = given["history"] + np.array([0.0, 0.0, 2000 * np.pi, 0.0])  # a simulation does not wrap headings
+    torch.testing.assert_close(make(**{**given, "history": turned}).history, plain.history, rtol=0, atol=2e-6)
+    given["history_mask"][0, 1, :3] = False
+    unseen = given["history"].copy()
+    unseen[0, 1, :3] = np.nan
+    made = make(**{**given, "history": unseen})
+    assert made.history.isfinite().all()
+    absent = np.concatenate([given["agent_mask"], [[False]]], 1)
+    wider = {name: np.concatenate([values, values[:, :1]], 1) for name, values in given.items()}
+    wider["history"][:, -1] += 50.0
+    padded = make(**{**wider, "agent_mask": absent})
+    torch.testing.assert_close(padded.frame, made.frame)
+    torch.testing.assert_close(padded.history[:, :-1], made.history)
+    assert torch.equal(padded.agent_mask, torch.as_tensor(absent))
+
+
+def test_some_vehicles_decide_on_the_frame(recorded: tuple[RecordedScenes, RoadScenes, np.ndarray]) -> None:
+    scenes, make, origin = recorded
+    given = vehicles(scenes, origin)
+    only = make(**{name: values[:, :1] for name, values in given.items()})
+    torch.testing.assert_close(make(**given, framed=1).frame, only.frame)
+    assert not torch.allclose(make(**given).frame[0, :2], only.frame[0, :2], atol=1.0)
+
+
+def test_vehicles_in_all_directions_have_the_frame_of_the_first(
+    recorded: tuple[RecordedScenes, RoadScenes, np.ndarray],
+) -> None:
+    scenes, make, origin = recorded
+    given = {name: np.concatenate([values[:, :1]] * 2, 1) for name, values in vehicles(scenes, origin).items()}
+    given["history"][0, 1, :, 2] += np.pi
+    heading = torch.tensor(given["history"][0, 0, -1, 2])
+    torch.testing.assert_close(make(**given).frame[0, 2].double(), heading, atol=1e-5, rtol=0)
+
+
+def test_lanes_without_a_limit_have_that_of_the_windows(
+    recorded: tuple[RecordedScenes, RoadScenes, np.ndarray],
+) -> None:
+    scenes, make, origin = recorded
+    unlimited = dataclasses.replace(make.lanes, speed_limit=np.full(len(make.lanes.ids), np.nan))
+    made = RoadScenes(unlimited, make.windows)(**vehicles(scenes, origin))
+    assert made.reference_speed is not None
+    assert bool((made.reference_speed == make.windows.speed_limit).all())
 
 
 def test_agents_that_keep_going_stay_on_their_lanes() -> None:

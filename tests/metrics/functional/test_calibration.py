@@ -48,6 +48,8 @@ def test_the_brier_score_adds_the_squared_error_of_the_closest_modes_probability
     assert value.item() == pytest.approx(1.0 + 0.7**2)
     tie = brier_min_sade(modes_at(1.0, -1.0, 1.0), torch.tensor([[0.2, 0.5, 0.3]]), *ONE)
     assert tie.item() == pytest.approx(1.0 + 0.8**2), "the first of the closest modes"
+    unknown = brier_min_sade(modes_at(2.0, 1.0), torch.tensor([[0.5, math.nan]]), *ONE)
+    assert unknown.item() == math.inf, "a probability that is not a number is not left out of the mean"
 
 
 def test_missed_scenes_have_no_mode_within_the_radius() -> None:

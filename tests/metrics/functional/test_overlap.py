@@ -35,6 +35,14 @@ def test_radius_is_half_of_the_size_and_touching_is_no_overlap(shape: str, dista
     assert rate([[0, 0, 0], [distance, 0, 0]], shape) == expected
 
 
+@pytest.mark.parametrize("shape", ["disc", "box"])
+def test_touching_is_no_overlap_in_any_direction_in_spite_of_rounding(shape: str) -> None:
+    for heading in torch.linspace(-3.0, 3.0, 61).tolist():
+        beside = [0.5 * math.cos(heading), 0.5 * math.sin(heading), heading]
+        assert rate([[0, 0, heading], beside], shape) == 0.0
+        assert rate([[0, 0, heading], [0.99999 * beside[0], 0.99999 * beside[1], heading]], shape) == 1.0
+
+
 @pytest.mark.parametrize(("shape", "expected"), [("disc", 0.0), ("box", 1.0)])
 def test_corners_overlap_for_boxes_but_not_for_discs(shape: str, expected: float) -> None:
     assert rate([[0, 0, 0], [0.45, 0.45, 0]], shape) == expected
