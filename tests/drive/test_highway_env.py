@@ -60,6 +60,19 @@ def test_forecasters_are_shown_the_nearest_vehicles_alone(world: TrafficWorld) -
     assert distance[1 : WINDOWS.agents].max() <= distance[WINDOWS.agents :].max()
 
 
+def test_other_drivers_see_where_the_planned_vehicle_was_put(world: TrafficWorld) -> None:
+    world.reset([0])
+    simulation = world.rides[0].simulation
+    now = simulation.moment().states[0]
+    after = now + np.array([1.0, 0.5, 0.2, 0.3])
+    simulation.step((now, after))
+    vehicle = simulation._vehicles[0]
+    seen = np.array(
+        [vehicle.position[0], -vehicle.position[1], -vehicle.heading, vehicle.speed]
+    )  # y and turns are mirrored
+    np.testing.assert_allclose(seen, after, atol=1e-9)
+
+
 def test_scenes_on_several_maps_have_the_order_of_their_episodes() -> None:
     merge, roundabout = (highway_env_world(2, seed=1, place=place) for place in ("merge", "roundabout"))
     merge.reset([0, 1])
@@ -121,7 +134,9 @@ def test_a_vehicle_that_merges_has_to_leave_its_lane() -> None:
     roads = HighwayEnvSimulator(1, 1, "merge").roads
     ramp, road = np.array([280.0, -8.0, 0.0, 20.0]), np.array([280.0, -4.0, 0.0, 20.0])
     assert (roads.position(ramp, 0.0).line, roads.position(road, 0.0).line) == (0, 1)
-    assert roads.position(np.array([312.0, -8.0, 0.0, 20.0]), 0.0).off_road
+    assert not roads.position(np.array([310.2, -8.0, 0.0, 20.0]), 0.0).off_road
+    for x in (310.4, 312.0):  # the lane ends at 310 m
+        assert roads.position(np.array([x, -8.0, 0.0, 20.0]), 0.0).off_road
     assert not roads.position(np.array([312.0, -4.0, 0.0, 20.0]), 0.0).off_road
     assert roads.position(np.array([400.0, -4.0, 0.0, 20.0]), 0.0).arrived
 
