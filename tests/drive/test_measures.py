@@ -88,6 +88,7 @@ def test_comfort_progress_and_deadlocks() -> None:
     assert found["deadlock"] == 0.0
     assert found["height"] == 1.0, "a measure of the world"
     assert values(meeting(1.0, speed=0.0))["deadlock"] == 1.0
+    assert values(meeting(1.0, speed=-0.5))["deadlock"] == 0.0, "it drives backwards"
     standing = meeting(1.0, speed=0.0)
     assert values(standing, arrived=0.0)["deadlock"] == 0.0, "it has arrived"
     standing.outcome.states[:, 0, ::15, 3] = 1.0

@@ -105,9 +105,13 @@ def test_a_run_of_roads_is_scored_on_pedestrians_without_a_map(
     assert file.read_bytes() == written
     assert epo("evaluate", f"run={run}", "data=ucy", f"data.folder={folder}", "workers=1", "checkpoint=last") == 0
     assert len(others(run)) == 2
+    before = {*others(run)}
+    assert epo("evaluate", f"run={run}", "data=ucy", f"data.folder={folder}", "workers=1", "data.share=0.5") == 0
+    (half,) = {*others(run)} - before
+    assert content(half)["scenes"] == round(found["scenes"] / 2)
     pedestrians.square(folder, seed=1)  # the recordings have changed
     assert epo("evaluate", f"run={run}", "data=ucy", f"data.folder={folder}", "workers=1") == 0
-    assert len(others(run)) == 3
+    assert len(others(run)) == 4
     assert len({content(file)["data_digest"] for file in others(run)}) == 2
     assert file.read_bytes() == written
 
