@@ -67,9 +67,8 @@ def test_other_drivers_see_where_the_planned_vehicle_was_put(world: TrafficWorld
     after = now + np.array([1.0, 0.5, 0.2, 0.3])
     simulation.step((now, after))
     vehicle = simulation._vehicles[0]
-    seen = np.array(
-        [vehicle.position[0], -vehicle.position[1], -vehicle.heading, vehicle.speed]
-    )  # y and turns are mirrored
+    x, y = vehicle.position
+    seen = np.array([x, -y, -vehicle.heading, vehicle.speed])  # y and turns are mirrored
     np.testing.assert_allclose(seen, after, atol=1e-9)
 
 
