@@ -62,10 +62,12 @@ def generate_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None
     dataset = settings.data.get("dataset", "rpi")
     row = f"{dataset}/v_lstm_epo" + ("_relaxed" if dataset == "rpi" else "")
     kept = [word for word in overrides if word.startswith(("data=", "data.", "--config-dir="))]
-    if dataset in HIGHWAYS or (tree() / "conf" / "experiment" / f"{row}.yaml").is_file():
+    vehicles = dataset in HIGHWAYS
+    if (vehicles and data.task.map) or (tree() / "conf" / "experiment" / f"{row}.yaml").is_file():
         words = [f"experiment={row}", *(word for word in kept if word != f"data={dataset}")]
     else:
-        rows = "ucy" if not data.task.map else "urban" if settings.data.get("windows", {}).get("lines") else "exid"
+        with_map = "urban" if settings.data.get("windows", {}).get("lines") else "exid"
+        rows = with_map if data.task.map else "dut" if vehicles else "ucy"
         words = [f"experiment={rows}/v_lstm_epo", *kept]
     print(f"\nnext: epo train {shlex.join(words)} budget=short" + " (minutes; without a budget: the paper's settings)")
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 from pathlib import Path
 
 import pytest
@@ -102,6 +103,14 @@ def test_rows_from_recordings_to_the_table(epo: Epo, tmp_path: Path, capsys: pyt
     assert index["dt"] == 0.2
     pictures = {file.suffix for file in (tmp_path / "seen" / "figures").iterdir()}
     assert pictures == {".png", ".gif"}
+
+
+def test_the_next_command_for_vehicles_without_a_map_is_accepted(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
+    assert epo("generate", "data=exid", *DATA, "data.map=false", "data.windows.lane_change=false", "workers=1") == 0
+    (following,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("next: ")]
+    words = shlex.split(following.removeprefix("next: epo train ").partition(" (")[0])
+    assert words[0] == "experiment=dut/v_lstm_epo"
+    assert epo("config", "check", *words) == 0
 
 
 @pytest.mark.skipif(not (SHARED / "data" / "us101").is_dir(), reason="the US-101 scenarios are not here")
