@@ -66,8 +66,8 @@ def generate_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None
     if (vehicles and data.task.map) or (tree() / "conf" / "experiment" / f"{row}.yaml").is_file():
         words = [f"experiment={row}", *(word for word in kept if word != f"data={dataset}")]
     else:
-        with_map = "urban" if settings.data.get("windows", {}).get("lines") else "exid"
-        rows = with_map if data.task.map else "dut" if vehicles else "ucy"
+        on_lanes = "urban" if settings.data.get("windows", {}).get("lines") else "exid"
+        rows = on_lanes if data.task.map else "dut" if vehicles else "ucy"
         words = [f"experiment={rows}/v_lstm_epo", *kept]
     print(f"\nnext: epo train {shlex.join(words)} budget=short" + " (minutes; without a budget: the paper's settings)")
 
