@@ -10,8 +10,9 @@ import os
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -32,7 +33,7 @@ def main(words: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if words is None else words)
     trace = "--traceback" in words
     try:
-        with _termination():
+        with _termination(), nullcontext() if trace else _warnings_in_lines():
             _run([word for word in words if word != "--traceback"])
     except ConfigError as error:
         if trace:
@@ -55,6 +56,21 @@ def main(words: Sequence[str] | None = None) -> None:
         if ending.code == TERMINATED:
             print(_farewell("terminated", words, ending), file=sys.stderr)
         raise
+
+
+@contextmanager
+def _warnings_in_lines() -> Iterator[None]:
+    """Context in which a warning is printed as one line, without the line of code that raised it."""
+
+    def line(message: Warning | str, category: type[Warning], *_: object, **__: object) -> str:
+        kind = "warning" if issubclass(category, UserWarning) else category.__name__
+        return f"epo: {kind}: {mask(str(message))}\n"
+
+    usual, warnings.formatwarning = warnings.formatwarning, line
+    try:
+        yield
+    finally:
+        warnings.formatwarning = usual
 
 
 def _farewell(ended: str, words: Sequence[str], ending: BaseException) -> str:
@@ -206,7 +222,7 @@ def _config(arguments: Arguments) -> None:
     from epo_lightning.schema import read
 
     settings = read(Settings, config)
-    data, model = assembly.check_buildable(settings)
+    data, model = assembly.check_buildable(settings, words)
     try:
         digest = data.digest
     except ConfigError as error:
@@ -277,7 +293,7 @@ def _multirun(arguments: Arguments) -> None:
 
         for job in listed:
             settings = read(Settings, compose.compose("train", job, arguments.extra))
-            data, _ = assembly.check_buildable(settings)
+            data, _ = assembly.check_buildable(settings, job)
             train.refuse_occupied(settings, train.folder_for(settings), data.digest)
         print(f"{len(listed)} runs")
         for done in compose.launch("train", arguments.overrides, listed, task, arguments.extra):

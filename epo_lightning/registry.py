@@ -16,10 +16,11 @@ import difflib
 import inspect
 import pkgutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
+from traceback import extract_tb
 from typing import Any, TypeVar
 
 Part = TypeVar("Part", bound=Callable[..., Any])
@@ -44,6 +45,20 @@ def place(part: Any) -> str:
         return f"{inspect.getsourcefile(part)}:{inspect.getsourcelines(part)[1]}"
     except (OSError, TypeError):
         return str(getattr(part, "__module__", type(part).__module__))
+
+
+def failing_place(error: BaseException, part: Any) -> str:
+    """File and line of a class's or function's own file at which an exception came from a call of it.
+
+    The place of its definition if the exception did not pass through this file.
+    """
+    part = getattr(part, "func", part)  # of functools.partial
+    with suppress(OSError, TypeError):
+        own = inspect.getsourcefile(part)
+        lines = [frame.lineno for frame in extract_tb(error.__traceback__) if frame.filename == own]
+        if lines:
+            return f"{own}:{lines[-1]}"
+    return place(part)
 
 
 def register(group: str, name: str) -> Callable[[Part], Part]:
@@ -76,7 +91,7 @@ _HOMES = {
     "data": "data",
     "dynamics": "game",
     "energy": "game",
-    "format": "data",
+    "format": "data.recorded.formats",
     "forecaster": "forecasters",
     "gate": "decoders",
     "objective": "objectives",
@@ -154,9 +169,9 @@ def lookup(group: str, name: str) -> Callable[..., Any]:
 def _home(group: str) -> str:
     """Place of a group's parts, in words."""
     home = import_module(f"epo_lightning.{_HOMES[group]}")
-    return (
-        f"a file of epo_lightning/{_HOMES[group]}" if hasattr(home, "__path__") else f"epo_lightning/{_HOMES[group]}.py"
-    )
+    path = f"epo_lightning/{_HOMES[group].replace('.', '/')}"
+    here = f"a file of {path}" if hasattr(home, "__path__") else f"{path}.py"
+    return f"{here}, or in a module that an entry point of an installed package names (pip install -e <folder>)"
 
 
 def check_keys(group: str, config: Mapping[str, Any], supplied: Iterable[str] = ()) -> None:

@@ -174,6 +174,8 @@ class RunFolder:
         if not run.config_file.is_file() or not run.record_file.is_file():
             below = [str(found.path) for found in discover(run.path)]
             hint = f"; runs below it: {', '.join(below[:8])} (use runs={run.path} for all)" if below else ""
+            if cls(run.path.parent).config_file.is_file():
+                hint = f"; its run is {run.path.parent}"
             raise ConfigError(f"{run.path} is not a run folder: it has no config.yaml and run.json{hint}")
         return run
 

@@ -36,7 +36,7 @@ FLOORS = {
     "encoders": {"scene"},
     "metrics": {"scene", "forecast", "registry", "checks"},
     "decoders": {"scene", "registry", "checks", "game", "host", "warp_kernels"},
-    "backbones": {"scene", "registry", "encoders", "decoders"},
+    "backbones": {"scene", "task", "registry", "encoders", "decoders"},
     "data": {"scene", "frames", "registry", "schema", "checks", "task", "metrics"},
     "objectives": {"scene", "forecast", "registry", "checks", "game", "solvers", "decoders", "losses"},
     "forecasters": {

@@ -61,7 +61,8 @@ def test_unknown_groups_are_refused_where_a_part_is_registered() -> None:
             "recurrent",
             r'A new one has @register\("backbone", "recurrent"\) above it, in a file of epo_light',
         ),
-        ("optimizer", "muon", "above it, in epo_lightning/optimizers.py$"),
+        ("optimizer", "muon", r"above it, in epo_lightning/optimizers\.py, or in a module that an entry point"),
+        ("format", "my_csv", r"above it, in a file of epo_lightning/data/recorded/formats, or .*\(pip install -e"),
         ("backbone", "v_lst", "did you mean 'v_lstm'. known: [^.]*$"),
     ],
 )

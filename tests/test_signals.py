@@ -1,9 +1,11 @@
-"""Every verb stopped by SIGTERM or Ctrl-C prints one line and exits with the status of that signal."""
+"""What a command prints beside its result: warnings, and a line when SIGTERM or Ctrl-C stops it, with the exit status."""
 
 from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import time
 
 import pytest
@@ -40,6 +42,22 @@ def test_a_stopped_verb_prints_a_message(
     assert message.count("\n") == 1
     assert "the same command continues" in message
     assert signal.getsignal(signal.SIGTERM) == before
+
+
+def test_warnings_are_printed_as_lines_without_code() -> None:
+    program = (
+        "import warnings; from epo_lightning import cli\n"
+        "def run(words):\n"
+        "    warnings.warn('see http://me:secret@host', stacklevel=1)\n"
+        "    warnings.warn('old', FutureWarning, stacklevel=1)\n"
+        "cli._run = run\n"
+        "cli.main([])\n"
+        "warnings.warn('later', stacklevel=1)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, env={"PATH": ""})
+    lines = done.stderr.splitlines()
+    assert lines[:2] == ["epo: warning: see http://me:***@host", "epo: FutureWarning: old"]
+    assert "UserWarning: later" in lines[2]
 
 
 def test_a_stopped_multirun_is_continued_by_itself() -> None:

@@ -232,7 +232,8 @@ def manifest(folder: Path, command: str = "", config: Mapping[str, Any] | None =
     """
     if not folder.is_dir():
         kind = folder.name.partition("-")[0].upper()
-        hint = f"; make it with `{command}`, and any other data.* settings of this command" if command else ""
+        others = "and any other data.* settings and --config-dir of this command"
+        hint = f"; make it with `{command}`, {others}" if command else ""
         raise CacheError(f"no {kind} data at {folder}{hint}")
     path = folder / MANIFEST
     try:

@@ -6,7 +6,7 @@ import logging
 import signal
 import threading
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -21,9 +21,13 @@ from lightning.pytorch.strategies import Strategy
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from epo_lightning import registry
+from epo_lightning.backbones.base import Backbone
+from epo_lightning.backbones.trial import try_backbone
 from epo_lightning.data.datamodule import check_divisible
+from epo_lightning.data.recorded.recordings import RecordedData
 from epo_lightning.experiment import debugging, step_graph
 from epo_lightning.experiment.checkpoints import WholeCheckpoints
+from epo_lightning.experiment.config.replaced import keys_of
 from epo_lightning.experiment.config.settings import PARTS, Settings, TrainerSettings
 from epo_lightning.experiment.dashboards import mlflow
 from epo_lightning.forecasters import SUPPLIED, Forecaster, build_forecaster
@@ -59,8 +63,30 @@ def describe_model(settings: Settings, data: Any) -> dict[str, Any]:
     return {**sections, "goal": settings.goal, **data.task.to_config()}
 
 
-def build(settings: Settings) -> tuple[Any, Forecaster]:
+def refuse_missing_folder(data: Any, given: Collection[str]) -> None:
+    """Refuse a folder of recordings that the user has named and that does not exist, because a misspelt name would have the
+    same effect as no folder: the cache would be searched for a data set of these settings.
+
+    Args:
+        data: a data module.
+        given: keys that the user has set.
+
+    Raises:
+        ConfigError: ``data.folder`` is one of them, and there is no such folder.
+    """
+    if isinstance(data, RecordedData) and "data.folder" in given and not data.folder_of_recordings.exists():
+        raise ConfigError(
+            f"data.folder={data.folder_of_recordings}: there is no such folder; correct it, or leave data.folder out if the "
+            "recordings are not on this machine: a data set that was extracted from them is then searched in the cache"
+        )
+
+
+def build(settings: Settings, overrides: Sequence[str] = ()) -> tuple[Any, Forecaster]:
     """The data module and the forecaster of a run. Initial weights are drawn from the global random state; no data is read.
+
+    Args:
+        settings: the settings of the run.
+        overrides: the user's overrides.
 
     Raises:
         ConfigError: a part, key or value that cannot work, or sizes that do not fit together, in one sentence.
@@ -68,6 +94,7 @@ def build(settings: Settings) -> tuple[Any, Forecaster]:
     if settings.logger.mlflow is not None:
         mlflow.check_settings(settings.logger.mlflow)
     data = build_data(settings.data)
+    refuse_missing_folder(data, keys_of(overrides))
     # The order of the batches belongs to the run; data.seed draws the scenes and splits.
     data.order_seed = settings.seed
     check_divisible(getattr(data, "batch_size", settings.trainer.devices), settings.trainer.devices)
@@ -112,6 +139,8 @@ def build_model(settings: Settings, data: Any) -> Forecaster:
         check_part(group, configuration[group], SUPPLIED[group])
     try:
         forecaster = build_forecaster(configuration)
+        if isinstance(backbone := getattr(forecaster, "backbone", None), Backbone):
+            try_backbone(backbone, data.task)
     except ConfigError:
         raise
     except (TypeError, ValueError, RuntimeError, ArithmeticError) as error:
@@ -127,14 +156,14 @@ def parameters(model: torch.nn.Module) -> int:
     return sum(parameter.numel() for parameter in model.parameters() if parameter.requires_grad)
 
 
-def check_buildable(settings: Settings) -> tuple[Any, Forecaster]:
+def check_buildable(settings: Settings, overrides: Sequence[str] = ()) -> tuple[Any, Forecaster]:
     """Check that data module and forecaster can be built, without an effect on random states and without warnings.
 
     Raises:
         ConfigError: as :func:`build`.
     """
     with torch.random.fork_rng(devices=[]), warnings.catch_warnings(action="ignore"):
-        return build(settings)
+        return build(settings, overrides)
 
 
 def _suspects(model: Mapping[str, Any]) -> str:

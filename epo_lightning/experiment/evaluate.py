@@ -18,9 +18,10 @@ from epo_lightning.data.cache import file_digest
 from epo_lightning.data.rpi.scenes import RPIData
 from epo_lightning.experiment import assembly, logs
 from epo_lightning.experiment.callbacks import style_of
+from epo_lightning.experiment.config.replaced import keys_of
 from epo_lightning.experiment.config.settings import EvaluateSettings, Settings, TrainerSettings
 from epo_lightning.experiment.opening import open_checkpoint, open_data, settings_of, split_of
-from epo_lightning.experiment.other_data import OtherData, keys_of, open_other
+from epo_lightning.experiment.other_data import OtherData, open_other
 from epo_lightning.experiment.truth import TruthTest
 from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.registry import ConfigError

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -121,6 +121,7 @@ def open_other(
     """
     section, notes = follow(section, of_run, forecaster.task, given)
     data, name = assembly.build_data(section), str(section.get("dataset") or section["name"])
+    assembly.refuse_missing_folder(data, given)
     check_fits(forecaster, data, name)
     known, asked = _of_training(run, of_run), split is not None
     split = split or _usual_split(run, section)
@@ -140,11 +141,6 @@ def open_other(
         scenes = OpenSpace(scenes)
         notes += ("no map: lanes are absent, and goals are chosen among points ahead (docs/transfer.md)",)
     return OtherData(name, split, data, scenes, section, notes)
-
-
-def keys_of(overrides: Sequence[str]) -> set[str]:
-    """The keys that overrides set: ``data.folder`` of ``data.folder=data/us101``."""
-    return {word.lstrip("+~").partition("=")[0] for word in overrides}
 
 
 def follow(

@@ -11,9 +11,10 @@ from torch import Tensor
 
 from epo_lightning import pretrained
 from epo_lightning.experiment import assembly
+from epo_lightning.experiment.config.replaced import keys_of
 from epo_lightning.experiment.config.settings import ForecastSettings, PredictSettings, Settings
 from epo_lightning.experiment.opening import open_checkpoint, open_data, settings_of
-from epo_lightning.experiment.other_data import keys_of, open_other
+from epo_lightning.experiment.other_data import open_other
 from epo_lightning.experiment.pictures import choose, draw, forecast_of, pick, spread
 from epo_lightning.forecast import JointForecast
 from epo_lightning.forecasters import Forecaster

@@ -62,7 +62,7 @@ def train(config: dict[str, Any], overrides: Sequence[str] = (), begun: RunFolde
     assembly.quiet()
     settings = read(Settings, config)
     seed_everything(settings.seed, workers=True, verbose=False)
-    data, forecaster = assembly.build(settings)
+    data, forecaster = assembly.build(settings, overrides)
     step_graph.check_machine(settings)
     run = begun or folder_for(settings)
     if settings.trainer.devices > 1 and follower.trained_as_follower(settings.trainer.devices, run):

@@ -66,7 +66,7 @@ def generate_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None
     if (vehicles and data.task.map) or (tree() / "conf" / "experiment" / f"{row}.yaml").is_file():
         words = [f"experiment={row}", *(word for word in kept if word != f"data={dataset}")]
     else:
-        on_lanes = "urban" if settings.data.get("windows", {}).get("lines") else "exid"
+        on_lanes = "urban" if settings.data.get("windows", {}).get("lines") else "highway"
         rows = on_lanes if data.task.map else "dut" if vehicles else "ucy"
         words = [f"experiment={rows}/v_lstm_epo", *kept]
     print(f"\nnext: epo train {shlex.join(words)} budget=short" + " (minutes; without a budget: the paper's settings)")
@@ -82,8 +82,10 @@ def make_data(settings: GenerateSettings, overrides: Sequence[str] = ()) -> Any:
         ConfigError: settings that do not fit this data, or recordings that are missing or cannot be read.
     """
     from epo_lightning.experiment import assembly
+    from epo_lightning.experiment.config.replaced import keys_of
 
     data = assembly.build_data(settings.data)
+    assembly.refuse_missing_folder(data, keys_of(overrides))
     known = inspect.signature(data.generate).parameters
     special: dict[str, Any] = {}
     if settings.strict:

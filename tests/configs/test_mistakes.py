@@ -17,6 +17,7 @@ MISTAKES = {
     "train sede=1": "'seed'",
     "train +sede=1": "'seed'",
     "train data.batch=1": "'batch_size'",
+    "config check train data=exid data.history=12": "in data: it is data.windows.history",
     "train +data.foo=1": "data.foo",
     "train solver.step=3": "'steps'",
     "train trainer.max_epoch=3": "'max_epochs'",
@@ -109,6 +110,17 @@ def test_missing_data_is_reported_before_a_folder_is_made(refused: Callable[...,
     assert "epo generate" in refused("train", "experiment=rpi/v_lstm", "data.root=nowhere")
 
 
+def test_an_option_of_a_folder_that_is_not_on_the_search_path_is_looked_for(
+    tmp_path: Path,
+    refused: Callable[..., str],  # noqa: F811
+) -> None:
+    file = tmp_path / "conf" / "data" / "own.yaml"
+    file.parent.mkdir(parents=True)
+    file.write_text("defaults: [ucy, _self_]\n")
+    said = "unknown option data=own: conf/data/own.yaml is found with the option --config-dir conf"
+    assert said in refused("generate", "data=own")
+
+
 def test_file_system_errors_give_one_message(epo: Epo, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:  # noqa: F811
     (tmp_path / "file").touch()
     assert epo("generate", "data=rpi_reduced", "data.root=file/cache", "progress=false") == 1
@@ -121,13 +133,13 @@ def test_a_check_without_the_data_says_in_one_line_what_is_missing(
     epo: Epo,  # noqa: F811
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    assert epo("config", "check", "experiment=exid/v_lstm_epo", "data.folder=nowhere", "data.root=empty") == 2
+    assert epo("config", "check", "experiment=exid/v_lstm_epo", "data.root=empty") == 2
     printed = capsys.readouterr()
     assert printed.out == ""
     assert printed.err.startswith(
         "epo: V-LSTM + EPO: the settings fit together, but the data cannot be used: no folder"
     )
-    assert "nowhere with exid recordings" in printed.err
+    assert "data/exid with exid recordings" in printed.err
     assert printed.err.endswith("point data.folder at the recordings, or unpack them there\n")
 
 

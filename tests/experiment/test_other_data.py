@@ -233,7 +233,7 @@ def test_what_does_not_fit_is_refused_with_a_reason(
     assert "split=all needs recordings, and data=drawn has none" in refused(
         "evaluate", run, "data=drawn", "data.like=highway", "split=all"
     )
-    assert "no folder nowhere with ucy recordings" in refused("evaluate", run, "data=ucy", "data.folder=nowhere")
+    assert "data.folder=nowhere: there is no such folder" in refused("evaluate", run, "data=ucy", "data.folder=nowhere")
     assert "too few" in refused("evaluate", run, "data=ucy", folder, "split=test")
 
 

@@ -139,6 +139,8 @@ def test_a_run_folder_takes_precedence_and_unknown_names_are_refused(
     (tmp_path / ROW).mkdir(parents=True)
     with pytest.raises(ConfigError, match="is not a run folder"):
         RunFolder.open(ROW)
+    with pytest.raises(ConfigError, match=f"; its run is {pretrained.HOME / ROW}$"):
+        RunFolder.open(pretrained.HOME / ROW / "checkpoints")
 
 
 def test_scores_of_a_shipped_forecaster_on_other_data_name_the_data(

@@ -192,14 +192,14 @@ class RecordedData(SceneDataModule):
                 f"data.folder={folder} ({len(config['recordings'])} recordings)" for folder, config in extracted
             )
             raise ConfigError(
-                f"no folder {home} with {self.dataset_name} recordings, and several data sets were extracted with these "
-                f"settings; choose one of {names}"
+                f"there is no folder {home} of {self.dataset_name} recordings, and several data sets were extracted with "
+                f"these settings; correct data.folder, or choose one of {names}"
             )
         if extracted:
             made, config = extracted[0]
             warnings.warn(
                 f"there is no folder {home}: the data set {made} is used, which was extracted with these settings from "
-                f"{len(config['recordings'])} recordings",
+                f"{len(config['recordings'])} recordings; correct data.folder if you have recordings",
                 stacklevel=2,
             )
             return config

@@ -29,6 +29,16 @@ LONGEST = 40.0
 """Largest length of a vehicle [m]; more indicates a wrong unit."""
 
 
+def _first_text(values: np.ndarray) -> str | None:
+    """The first entry that is text and no number; None if there is none."""
+    for value in values.ravel() if values.dtype.kind in "OUS" else ():
+        try:
+            float(value)
+        except (TypeError, ValueError):
+            return str(value)
+    return None
+
+
 @dataclass(frozen=True)
 class TrackTable:
     """Tracks of all agents of a recording. Rows are sorted by agent, and by frame within an agent; frames may be missing.
@@ -86,7 +96,9 @@ class TrackTable:
                 raise RecordingError(path, f"{name} is of type {given.dtype}; whole numbers were expected: number them")
         for name in ("position", "heading", "velocity", "size"):
             if not np.issubdtype((given := getattr(self, name)).dtype, np.floating):
-                raise RecordingError(path, f"{name} is of type {given.dtype}; floating-point numbers were expected")
+                text = _first_text(given)
+                what = f"of type {given.dtype}" if text is None else f"text, such as {text!r}"
+                raise RecordingError(path, f"{name} is {what}; floating-point numbers were expected")
         if not (np.isfinite(self.rate) and 1.0 <= self.rate <= 1000.0):
             raise RecordingError(path, f"a frame rate of {self.rate} Hz was expected to lie between 1 and 1000 Hz")
         by_agent = np.diff(self.agent)

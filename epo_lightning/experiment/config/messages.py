@@ -6,6 +6,7 @@ import inspect
 import re
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from epo_lightning.experiment.config.sources import EXPERIMENTS, file_of, options_of
@@ -155,6 +156,8 @@ def _missing_option(instance: Hydra, missing: str, message: str) -> str:
             f"unknown option {group}={option}: there is a part of this name, but no file conf/{group}/{option}.yaml, which "
             f"begins with the line `name: {option}`. {_known(option, options)}"
         )
+    if (file := Path("conf") / group / f"{option}.yaml").is_file():
+        return f"unknown option {group}={option}: {file} is found with the option --config-dir conf"
     return f"unknown option {group}={option}: {_known(option, options)}"
 
 
@@ -202,6 +205,11 @@ def _unknown_key(instance: Hydra, name: str, key: str, overrides: Sequence[str])
             return f"{key} needs a choice of {word}: add {word}=<one of {', '.join(options)}>"
         if word not in names and len(walked) == 1 and names and word in _arguments(walked[0], config):
             return f"{key} is a setting that the chosen file of {walked[0]} leaves at its default: set it by +{key}=<value>"
+        if word not in names and walked:
+            place = ".".join(walked)
+            inner = [name for name in names if isinstance(config[name], DictConfig) and word in config[name]]
+            if len(inner) == 1:
+                return f"unknown key {key!r} in {place}: it is {place}.{inner[0]}.{word}"
         if word not in names:
             if not walked and word != "hydra":  # groups whose options have no section of their own, such as experiment
                 defaults = instance.config_loader.compute_defaults_list(name, overrides=[], run_mode=RunMode.RUN)

@@ -32,7 +32,7 @@ def refuse_replaced(values: Mapping[str, Any], overrides: Iterable[str], found: 
         ConfigError: the keys and values of both files, and where such a setting can stand.
     """
     final = dict(leaves(values))
-    given = {word.lstrip("+~").partition("=")[0] for word in overrides}
+    given = keys_of(overrides)
     without_effect = [one for one in found if one.key not in given and final.get(one.key) == one.by]
     chosen = [one for one in without_effect if one.group == EXPERIMENTS or one.value != _default(values, one.key)]
     if chosen:
@@ -44,6 +44,11 @@ def refuse_replaced(values: Mapping[str, Any], overrides: Iterable[str], found: 
             f"sets {', '.join(others)}; with this budget, move such settings to the command line "
             f"({' '.join(override(one.key, one.value) for one in lost)}), to the file of a sweep, or to a budget of your own"
         )
+
+
+def keys_of(overrides: Iterable[str]) -> set[str]:
+    """The keys that overrides set: ``data.folder`` of ``data.folder=data/us101``."""
+    return {word.lstrip("+~").partition("=")[0] for word in overrides}
 
 
 def _default(values: Mapping[str, Any], key: str) -> Any:

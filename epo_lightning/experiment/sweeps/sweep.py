@@ -94,7 +94,7 @@ class Job:
             ConfigError: as :func:`assembly.check_buildable`.
         """
         settings = read(Settings, config)
-        data, _ = assembly.check_buildable(settings)
+        data, _ = assembly.check_buildable(settings, overrides)
         run = training.folder_for(settings)
         name = identity(config, data.digest)
         return cls(

@@ -138,7 +138,7 @@ def generate(name: str, overrides: Sequence[str], extra: Sequence[str]) -> None:
         raise ConfigError(f"{name} chooses its runs while it searches: make its data by `epo generate data=<name>`")
     for words in listed:
         settings = read(Settings, compose.compose("train", words, extra))
-        data, _ = assembly.check_buildable(settings)
+        data, _ = assembly.check_buildable(settings, words)
         if settings.data["name"] != "drawn":
             sections.setdefault(data.folder, settings.data)
     if not sections:

@@ -102,6 +102,8 @@ def test_mistakes_are_named(mistake: Callable[[TrackTable], dict[str, np.ndarray
             "ids is of type object; whole numbers",
         ),
         ("position", np.ones((AGENTS * STEPS, 2), dtype=int), "position is of type int64; floating-point numbers"),
+        ("heading", np.array(["0.5"] * 7 + ["north"] * 99), "heading is text, such as 'north'; floating-point numbers"),
+        ("heading", np.array(["0.5"] * 9), "heading is of type <U3; floating-point numbers"),
     ],
 )
 def test_numbers_of_another_type_are_refused(name: str, given: np.ndarray, said: str) -> None:
