@@ -55,7 +55,7 @@ def labels(
     def parts(own: Mapping[str, Any], text: Callable[[Any], str]) -> Iterator[str]:
         for key, value in own.items():
             if not complete[key]:
-                yield f"{keys[key]}={text(value)}"
+                yield f"{keys[key].removesuffix('.name')}={text(value)}"
             elif lacking := [entry for entry in complete[key] if entry not in value]:
                 yield f"{keys[key]} without {', '.join(lacking)}"
 

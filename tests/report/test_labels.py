@@ -63,8 +63,8 @@ def test_keys_are_shortened_while_unambiguous() -> None:
 def test_labels_equal_those_written_by_hand() -> None:
     settings = [{"solver.steps": steps, "solver.name": name} for steps, name in ((2, "lm"), (4, "x" * 40))]
     assert labels("V", settings, CONFIG, ["aaaa", "bbbb"]) == [
-        "V, steps=2, solver.name=lm",
-        f"V, steps=4, solver.name={'x' * 23}…",
+        "V, steps=2, solver=lm",
+        f"V, steps=4, solver={'x' * 23}…",
     ]
     assert labels("V", [{}], CONFIG, ["aaaa"]) == ["V"]
 
@@ -99,7 +99,7 @@ def test_rows_with_too_long_labels_are_named_by_their_parts_or_their_identity() 
     many = [{f"solver.k{number}": number + row for number in range(5)} for row in range(2)]
     assert labels("V", many, CONFIG, rows) == ["V, row 01234567", "V, row fedcba98"]
     parts = [{**entry, "backbone.name": name} for entry, name in zip(many, ("v_lstm", "vibes"), strict=True)]
-    assert labels("V", parts, CONFIG, rows) == ["V, backbone.name=v_lstm", "V, backbone.name=vibes"]
+    assert labels("V", parts, CONFIG, rows) == ["V, backbone=v_lstm", "V, backbone=vibes"]
     long = [{"solver.name": "x" * 50 + end} for end in "ab"]
     first, second = labels("V", long, CONFIG, rows)
     assert first != second
