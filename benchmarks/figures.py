@@ -1,4 +1,4 @@
-"""Figures of docs/game.md and docs/rpi_results.md.
+"""Figures of docs/game.md, docs/features.md and docs/rpi_results.md.
 
     python -m benchmarks.figures levels docs/figures/pair_features.png
     python -m benchmarks.figures weights docs/figures/inferred_w.png RUN [RUN ...]

@@ -26,6 +26,8 @@ def test_the_pages_of_results_have_templates() -> None:
             "urban",
             "family",
             "game",
+            "game_feedback",
+            "game_intentions",
             "transfer",
         )
     }
