@@ -15,12 +15,12 @@ from __future__ import annotations
 import difflib
 import inspect
 import pkgutil
+import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
-from traceback import extract_tb
 from typing import Any, TypeVar
 
 Part = TypeVar("Part", bound=Callable[..., Any])
@@ -55,7 +55,7 @@ def failing_place(error: BaseException, part: Any) -> str:
     part = getattr(part, "func", part)  # of functools.partial
     with suppress(OSError, TypeError):
         own = inspect.getsourcefile(part)
-        lines = [frame.lineno for frame in extract_tb(error.__traceback__) if frame.filename == own]
+        lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == own]
         if lines:
             return f"{own}:{lines[-1]}"
     return place(part)
