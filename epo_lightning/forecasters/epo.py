@@ -192,18 +192,17 @@ class EPO(GameForecaster):
             parameters = parameters.for_every_mode(self.modes)
         solution = self.differentiable_solve(self.minimiser, self.energy, solved_scene, parameters)
         settled = self._without_noise(solution, solved_scene, parameters)
-        states, controls = settled.states[..., : self.task.horizon, :], settled.controls[..., : self.task.horizon, :]
         logits = self._mode_logits(z, scene, goals, orders, settled)
         if self.one_game and self.probabilities is not None:
             # The solver may find one equilibrium of the game from several starts.
-            states, controls, logits = repeats_joined(states, controls, logits, scene.agent_mask)
+            settled, logits = repeats_joined(settled, logits, self.task.horizon, scene.agent_mask)
         return JointForecast(
-            states=states,
+            states=settled.states[..., : self.task.horizon, :],
             probabilities=logits.softmax(1),
-            controls=controls,
+            controls=settled.controls[..., : self.task.horizon, :],
             initial_states=self._states_of_initial_strategies(scene, parameters),
             parameters=parameters,
-            solution=solution,
+            solution=solution if SAMPLES in self.minimiser.provides else settled,
             goal_probabilities=goals.probabilities,
             order_logits=None if orders is None else orders.logits,
             logits=logits,

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from epo_lightning.decoders.orders import repeated
-from epo_lightning.forecast import same_motion
+from epo_lightning.forecast import Solution, same_motion
 
 
 def without_repeated_choices(logits: Float[Tensor, "B M"], choices: Shaped[Tensor, "B M D"]) -> Float[Tensor, "B M"]:
@@ -30,19 +30,33 @@ def earliest_same(states: Float[Tensor, "B M N K _"], agent_mask: Bool[Tensor, "
 
 
 def repeats_joined(
-    states: Float[Tensor, "B M N K 4"],
-    controls: Float[Tensor, "B M N K 2"],
-    logits: Float[Tensor, "B M"],
-    agent_mask: Bool[Tensor, "B N"],
-) -> tuple[Float[Tensor, "B M N K 4"], Float[Tensor, "B M N K 2"], Float[Tensor, "B M"]]:
-    """States, controls and logits of modes of which some have the same motion, and are one outcome.
+    solution: Solution, logits: Float[Tensor, "B M"], horizon: int, agent_mask: Bool[Tensor, "B N"]
+) -> tuple[Solution, Float[Tensor, "B M"]]:
+    """The solution and the logits of modes of which some have the same motion, and are one outcome.
 
-    The earliest of them has the probability of all. The others have a probability of zero, and its states and controls, so
-    that a score which takes the closest of equal modes takes the earliest one.
+    All of them get the strategies with the lowest energy among them: where a solver stops after a few steps, these are the
+    nearest to the equilibrium. The earliest mode has the probability of all, and the others a probability of zero. Because
+    the motions are equal, a score which takes the closest mode takes the earliest one.
+
+    Args:
+        solution: strategies of one game, whose energies can be compared.
+        logits: one logit per mode.
+        horizon: number of steps of the forecast, in which motions are compared.
+        agent_mask: agents that exist.
     """
-    earliest = earliest_same(states, agent_mask)
-    scenes = torch.arange(states.shape[0], device=states.device)[:, None]  # `len` would be a constant in an export
-    return states[scenes, earliest], controls[scenes, earliest], with_repeats_added(logits, earliest)
+    earliest = earliest_same(solution.states[..., :horizon, :], agent_mask)
+    lowest = lowest_of_same(solution.energy, earliest)
+    scenes = torch.arange(logits.shape[0], device=logits.device)[:, None]  # `len` would be a constant in an export
+    return solution.map(lambda tensor: tensor[scenes, lowest]), with_repeats_added(logits, earliest)
+
+
+def lowest_of_same(energy: Float[Tensor, "B M"], earliest: Int[Tensor, "B M"]) -> Int[Tensor, "B M"]:
+    """Index of the mode with the lowest energy among those that share their earliest mode (:func:`earliest_same`)."""
+    same = earliest[..., None] == earliest[:, None]
+    comparable = torch.where(
+        energy.isfinite(), energy, torch.finfo(energy.dtype).max
+    )  # argmin takes NaN for the smallest
+    return torch.where(same, comparable[:, None], torch.inf).argmin(-1)
 
 
 def with_repeats_added(logits: Float[Tensor, "B M"], earliest: Int[Tensor, "B M"]) -> Float[Tensor, "B M"]:

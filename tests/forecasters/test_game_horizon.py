@@ -13,8 +13,9 @@ from games import random_scene
 from suites import ForecasterSuite, model
 
 from epo_lightning.experiment.config.compose import compose
-from epo_lightning.forecast import JointForecast
+from epo_lightning.forecast import JointForecast, Solution
 from epo_lightning.forecasters import build_forecaster
+from epo_lightning.forecasters.repeats import repeats_joined
 from epo_lightning.optimizers import Adam
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import Scene
@@ -53,6 +54,11 @@ def scenes(count: int = 3, horizon: int = 40) -> Scene:
     )
 
 
+def joined(solution: Solution, scene: Scene) -> Solution:
+    """The solution after modes at one equilibrium have become one outcome, as that of a forecast of 40 steps."""
+    return repeats_joined(solution, torch.zeros_like(solution.energy), 40, scene.agent_mask)[0]
+
+
 class TestGame(ForecasterSuite):
     config = GAME
     lessons = 90
@@ -83,13 +89,11 @@ def test_the_forecast_is_the_beginning_of_the_solution_of_the_longer_game() -> N
     assert forecast.states.shape == (3, 2, 2, 40, 4)
     assert forecast.controls is not None
     assert forecast.controls.shape == (3, 2, 2, 40, 2)
-    kept = forecast.probabilities > 0  # modes that repeat an earlier one have its states
-    assert kept[:, 0].all()
-    assert torch.equal(forecast.states[kept], forecast.solution.states[kept][..., :40, :])
+    assert torch.equal(forecast.states, forecast.solution.states[..., :40, :])
     assert forecast.parameters is not None
     assert forecast.parameters.initial_controls.shape == (3, 2, 2, 46, 2)
     with torch.no_grad():
-        again = forecaster.solver(forecaster.energy, scene, forecast.parameters)
+        again = joined(forecaster.solver(forecaster.energy, scene, forecast.parameters), scene)
     torch.testing.assert_close(again.states, forecast.solution.states)
 
 
@@ -178,7 +182,7 @@ def test_calibration_solves_its_games_as_training_does(monkeypatch: pytest.Monke
     forecast = forecaster.predict(scene)
     minimiser, energy, game, parameters = seen[0]
     assert minimiser == forecaster.solver
-    refined = dataclasses.replace(minimiser, test_steps=None, steps=2)(energy, game, parameters)
+    refined = joined(dataclasses.replace(minimiser, test_steps=None, steps=2)(energy, game, parameters), scene)
     torch.testing.assert_close(forecast.solution.states, refined.states)
     assert not torch.equal(minimiser(energy, game, parameters).states, refined.states)
 

@@ -12,8 +12,9 @@ from hypothesis import given
 from test_game_horizon import SOLVER, built, scenes
 from torch import Tensor, nn
 
-from epo_lightning.forecast import DISTINCT, same_motion
-from epo_lightning.forecasters.repeats import earliest_same, repeats_joined, with_repeats_added
+from epo_lightning.forecast import DISTINCT, Solution, same_motion
+from epo_lightning.forecasters import epo
+from epo_lightning.forecasters.repeats import earliest_same, lowest_of_same, repeats_joined, with_repeats_added
 from epo_lightning.metrics.functional import brier_min_sade
 
 
@@ -114,7 +115,7 @@ def test_logits_without_repetitions_are_unchanged() -> None:
     assert torch.equal(with_repeats_added(logits, torch.arange(3).expand(4, 3)), logits)
 
 
-def test_a_game_with_one_equilibrium_has_one_outcome() -> None:
+def test_a_game_with_one_equilibrium_has_one_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two agents far from each other: both initial strategies lead to the same equilibrium, which gets all probability."""
     scene = scenes()
     history, goals = scene.history.clone(), scene.goal_candidates.clone()
@@ -124,11 +125,18 @@ def test_a_game_with_one_equilibrium_has_one_outcome() -> None:
     forecaster = built(calibration=None, solver={**SOLVER, "steps": 40, "newton_steps": 5})
     forecast = forecaster.predict(scene)
     assert forecast.solution is not None
-    assert not torch.equal(forecast.solution.states[:, 0], forecast.solution.states[:, 1])
     assert forecast.probabilities.tolist() == [[1.0, 0.0]] * 3
     assert torch.equal(forecast.states[:, 0], forecast.states[:, 1])
     assert forecast.controls is not None
     assert torch.equal(forecast.controls[:, 0], forecast.controls[:, 1])
+    assert torch.equal(forecast.controls, forecast.solution.controls[..., : forecast.controls.shape[3], :])
+    # The solver itself ends at two slightly different strategies; the forecast has those with the lowest energy.
+    with monkeypatch.context() as patch:
+        patch.setattr(epo, "repeats_joined", lambda solution, logits, horizon, mask: (solution, logits))
+        apart = forecaster.predict(scene).solution
+    assert apart is not None
+    assert not torch.equal(apart.states[:, 0], apart.states[:, 1])
+    assert torch.equal(forecast.solution.energy, apart.energy.amin(1, keepdim=True).expand_as(apart.energy))
     # The repetition is as close to any future as the mode that it repeats, so scores take the probability of the first.
     future = forecast.states[:, 1]
     score = brier_min_sade(
@@ -137,19 +145,53 @@ def test_a_game_with_one_equilibrium_has_one_outcome() -> None:
     assert score.tolist() == [0.0] * 3
 
 
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from([0.0, 0.6, 1.2, 5.0, 5.5]), st.sampled_from([-1.0, 0.0, 2.5, 1e30, math.inf, math.nan])
+        ),
+        min_size=1,
+        max_size=6,
+    )
+)
+def test_the_strategies_of_an_outcome_are_those_with_the_lowest_energy(modes: list[tuple[float, float]]) -> None:
+    offsets, energies = zip(*modes, strict=True)
+    earliest = earliest_same(motions([*offsets]), everyone())
+    found = lowest_of_same(torch.tensor([energies]), earliest)[0].tolist()
+    for mode, chosen in enumerate(found):
+        same = [other for other in range(len(modes)) if earliest[0, other] == earliest[0, mode]]
+        assert chosen in same
+        finite = [energies[other] for other in same if math.isfinite(energies[other])]
+        if finite:
+            assert torch.tensor(energies[chosen]) == torch.tensor(min(finite))
+
+
 def test_a_program_takes_any_number_of_scenes() -> None:
     class Joined(nn.Module):
-        def forward(self, states: Tensor, controls: Tensor, logits: Tensor, mask: Tensor) -> tuple[Tensor, ...]:
-            return repeats_joined(states, controls, logits, mask)
+        def forward(
+            self, states: Tensor, controls: Tensor, energy: Tensor, logits: Tensor, mask: Tensor
+        ) -> tuple[Tensor, ...]:
+            unknown, status = torch.zeros_like(energy), torch.zeros_like(energy, dtype=torch.long)
+            solution = Solution(controls, states, unknown, energy, unknown, status)
+            found, joined = repeats_joined(solution, logits, 3, mask)
+            return found.states, found.controls, found.energy, joined
 
     def given(scenes: int) -> tuple[Tensor, ...]:
         states = torch.randn(scenes, 3, 2, 4, 4)
-        states[:, 2] = states[:, 0]
-        return states, torch.randn(scenes, 3, 2, 4, 2), torch.randn(scenes, 3), torch.ones(scenes, 2, dtype=torch.bool)
+        states[:, 2, :, :3] = states[:, 0, :, :3]  # the same in the three steps of the forecast
+        controls, mask = torch.randn(scenes, 3, 2, 4, 2), torch.ones(scenes, 2, dtype=torch.bool)
+        return states, controls, torch.randn(scenes, 3), torch.randn(scenes, 3), mask
 
     scenes = torch.export.Dim("scenes", min=1)
-    program = torch.export.export(Joined(), given(3), dynamic_shapes=tuple({0: scenes} for _ in range(4))).module()
+    program = torch.export.export(Joined(), given(3), dynamic_shapes=tuple({0: scenes} for _ in range(5))).module()
     for count in (1, 7):
         arguments = given(count)
-        for found, wanted in zip(program(*arguments), repeats_joined(*arguments), strict=True):
-            assert torch.equal(found, wanted)
+        found = program(*arguments)
+        for one, wanted in zip(found, Joined()(*arguments), strict=True):
+            assert torch.equal(one, wanted)
+        states, controls, energy, _ = found
+        assert torch.equal(states[:, 0], states[:, 2])
+        assert torch.equal(energy[:, 0], torch.minimum(arguments[2][:, 0], arguments[2][:, 2]))
+        first = arguments[2][:, 0] <= arguments[2][:, 2]
+        assert torch.equal(controls[first, 2], arguments[1][first, 0])
+        assert torch.equal(controls[~first, 0], arguments[1][~first, 2])
