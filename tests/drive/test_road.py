@@ -173,6 +173,16 @@ def test_controls_of_the_planned_vehicle_cost_in_themselves_and_those_of_others_
     assert usual[0, 0, 1].any()
 
 
+@pytest.mark.parametrize(("speed", "scale"), [(20.0, 20.0), (1.5, 1.5), (0.2, 1.0), (0.0, 1.0)])
+def test_the_planned_vehicle_pays_for_the_share_of_its_reference_speed(speed: float, scale: float) -> None:
+    """Below 1 m/s, as in front of a closed lane, the weight does not grow further."""
+    scene = dataclasses.replace(bend(15.0, 0.0), reference_speed=torch.full((1, 2), speed, dtype=torch.double))
+    weights = road_game(scene, torch.tensor([1]), 20, turning=0.5).own_weights
+    torch.testing.assert_close(weights["velref"], torch.tensor([[[1.0 / scale, 0.0]]], dtype=torch.double))
+    torch.testing.assert_close(weights["turnacc"], torch.tensor([[[2.5, 2.5]]], dtype=torch.double))
+    torch.testing.assert_close(weights["accref"], torch.tensor([[[0.5, 0.7]]], dtype=torch.double))
+
+
 def queue(gap: float) -> Scene:
     """A vehicle at 20 m/s on a straight lane, and one that stands ``gap`` metres ahead of it."""
     history = torch.tensor([[[[0.0, 0.0, 0.0, 20.0]], [[gap, 0.0, 0.0, 0.0]]]], dtype=torch.double)

@@ -200,6 +200,17 @@ def test_recordings_of_another_rate_are_read_at_the_runs(trained: Path) -> None:
     assert follow({"name": "drawn"}, settings, task) == ({"name": "drawn"}, ())
 
 
+def test_the_frame_of_other_data_is_that_of_the_run_unless_it_is_given():
+    fixed = read(Settings, compose("train", ["experiment=exid/v_lstm_epo", "data.frame=fixed"]))
+    drawn = read(Settings, compose("train", ["experiment=exid/v_lstm_epo", "data=drawn"]))
+    task = build_data(fixed.data).task
+    section = compose("evaluate", ["run=x", "data=exid"])["data"]
+    assert section["frame"] == "aligned"
+    assert follow(section, fixed, task)[0]["frame"] == "fixed"
+    assert follow(section, fixed, task, {"data.frame"})[0]["frame"] == "aligned"
+    assert follow({**section, "frame": "fixed"}, drawn, task)[0]["frame"] == "fixed"
+
+
 def test_games_for_an_earlier_run_are_of_its_recipe():
     settings = read(Settings, compose("train", ["experiment=rpi/v_lstm_epo"]))
     section, task = dict(settings.data), build_data(settings.data).task
