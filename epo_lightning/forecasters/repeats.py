@@ -34,28 +34,29 @@ def repeats_joined(
 ) -> tuple[Solution, Float[Tensor, "B M"]]:
     """The solution and the logits of modes of which some have the same motion, and are one outcome.
 
-    All of them get the strategies with the lowest energy among them: where a solver stops after a few steps, these are the
-    nearest to the equilibrium. The earliest mode has the probability of all, and the others a probability of zero. Because
-    the motions are equal, a score which takes the closest mode takes the earliest one.
+    All of them get the strategies with the smallest gradient among them: where a solver stops after a few steps, these are
+    the nearest to the equilibrium. The earliest mode has the probability of all, and the others a probability of zero.
+    Because the motions are equal, a score which takes the closest mode takes the earliest one.
 
     Args:
-        solution: strategies of one game, whose energies can be compared.
+        solution: strategies of one game.
         logits: one logit per mode.
         horizon: number of steps of the forecast, in which motions are compared.
         agent_mask: agents that exist.
     """
     earliest = earliest_same(solution.states[..., :horizon, :], agent_mask)
-    lowest = lowest_of_same(solution.energy, earliest)
+    nearest = smallest_of_same(solution.gradient_norm, earliest)
     scenes = torch.arange(logits.shape[0], device=logits.device)[:, None]  # `len` would be a constant in an export
-    return solution.map(lambda tensor: tensor[scenes, lowest]), with_repeats_added(logits, earliest)
+    return solution.map(lambda tensor: tensor[scenes, nearest]), with_repeats_added(logits, earliest)
 
 
-def lowest_of_same(energy: Float[Tensor, "B M"], earliest: Int[Tensor, "B M"]) -> Int[Tensor, "B M"]:
-    """Index of the mode with the lowest energy among those that share their earliest mode (:func:`earliest_same`)."""
+def smallest_of_same(norm: Float[Tensor, "B M"], earliest: Int[Tensor, "B M"]) -> Int[Tensor, "B M"]:
+    """Index of the mode with the smallest norm among those that share their earliest mode (:func:`earliest_same`).
+
+    It is the first of them if no norm is finite, as for an energy without a gradient.
+    """
     same = earliest[..., None] == earliest[:, None]
-    comparable = torch.where(
-        energy.isfinite(), energy, torch.finfo(energy.dtype).max
-    )  # argmin takes NaN for the smallest
+    comparable = torch.where(norm.isfinite(), norm, torch.finfo(norm.dtype).max)  # argmin takes NaN as the least
     return torch.where(same, comparable[:, None], torch.inf).argmin(-1)
 
 

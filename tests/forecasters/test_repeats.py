@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from epo_lightning.forecast import DISTINCT, Solution, same_motion
 from epo_lightning.forecasters import epo
-from epo_lightning.forecasters.repeats import earliest_same, lowest_of_same, repeats_joined, with_repeats_added
+from epo_lightning.forecasters.repeats import earliest_same, smallest_of_same, repeats_joined, with_repeats_added
 from epo_lightning.metrics.functional import brier_min_sade
 
 
@@ -130,13 +130,14 @@ def test_a_game_with_one_equilibrium_has_one_outcome(monkeypatch: pytest.MonkeyP
     assert forecast.controls is not None
     assert torch.equal(forecast.controls[:, 0], forecast.controls[:, 1])
     assert torch.equal(forecast.controls, forecast.solution.controls[..., : forecast.controls.shape[3], :])
-    # The solver itself ends at two slightly different strategies; the forecast has those with the lowest energy.
+    # The solver itself ends at two slightly different strategies; the forecast has those with the smallest gradient.
     with monkeypatch.context() as patch:
         patch.setattr(epo, "repeats_joined", lambda solution, logits, horizon, mask: (solution, logits))
         apart = forecaster.predict(scene).solution
     assert apart is not None
     assert not torch.equal(apart.states[:, 0], apart.states[:, 1])
-    assert torch.equal(forecast.solution.energy, apart.energy.amin(1, keepdim=True).expand_as(apart.energy))
+    norm = apart.gradient_norm
+    assert torch.equal(forecast.solution.gradient_norm, norm.amin(1, keepdim=True).expand_as(norm))
     # The repetition is as close to any future as the mode that it repeats, so scores take the probability of the first.
     future = forecast.states[:, 1]
     score = brier_min_sade(
@@ -148,39 +149,41 @@ def test_a_game_with_one_equilibrium_has_one_outcome(monkeypatch: pytest.MonkeyP
 @given(
     st.lists(
         st.tuples(
-            st.sampled_from([0.0, 0.6, 1.2, 5.0, 5.5]), st.sampled_from([-1.0, 0.0, 2.5, 1e30, math.inf, math.nan])
+            st.sampled_from([0.0, 0.6, 1.2, 5.0, 5.5]), st.sampled_from([0.0, 1e-9, 2.5, 1e30, math.inf, math.nan])
         ),
         min_size=1,
         max_size=6,
     )
 )
-def test_the_strategies_of_an_outcome_are_those_with_the_lowest_energy(modes: list[tuple[float, float]]) -> None:
-    offsets, energies = zip(*modes, strict=True)
+def test_the_strategies_of_an_outcome_are_those_with_the_smallest_gradient(modes: list[tuple[float, float]]) -> None:
+    offsets, norms = zip(*modes, strict=True)
     earliest = earliest_same(motions([*offsets]), everyone())
-    found = lowest_of_same(torch.tensor([energies]), earliest)[0].tolist()
+    found = smallest_of_same(torch.tensor([norms]), earliest)[0].tolist()
     for mode, chosen in enumerate(found):
         same = [other for other in range(len(modes)) if earliest[0, other] == earliest[0, mode]]
         assert chosen in same
-        finite = [energies[other] for other in same if math.isfinite(energies[other])]
+        finite = [norms[other] for other in same if math.isfinite(norms[other])]
         if finite:
-            assert torch.tensor(energies[chosen]) == torch.tensor(min(finite))
+            assert torch.tensor(norms[chosen]) == torch.tensor(min(finite))
+        else:
+            assert chosen == same[0]
 
 
 def test_a_program_takes_any_number_of_scenes() -> None:
     class Joined(nn.Module):
         def forward(
-            self, states: Tensor, controls: Tensor, energy: Tensor, logits: Tensor, mask: Tensor
+            self, states: Tensor, controls: Tensor, norm: Tensor, logits: Tensor, mask: Tensor
         ) -> tuple[Tensor, ...]:
-            unknown, status = torch.zeros_like(energy), torch.zeros_like(energy, dtype=torch.long)
-            solution = Solution(controls, states, unknown, energy, unknown, status)
+            unknown, status = torch.zeros_like(norm), torch.zeros_like(norm, dtype=torch.long)
+            solution = Solution(controls, states, unknown, unknown, norm, status)
             found, joined = repeats_joined(solution, logits, 3, mask)
-            return found.states, found.controls, found.energy, joined
+            return found.states, found.controls, found.gradient_norm, joined
 
     def given(scenes: int) -> tuple[Tensor, ...]:
         states = torch.randn(scenes, 3, 2, 4, 4)
         states[:, 2, :, :3] = states[:, 0, :, :3]  # the same in the three steps of the forecast
         controls, mask = torch.randn(scenes, 3, 2, 4, 2), torch.ones(scenes, 2, dtype=torch.bool)
-        return states, controls, torch.randn(scenes, 3), torch.randn(scenes, 3), mask
+        return states, controls, torch.rand(scenes, 3), torch.randn(scenes, 3), mask
 
     scenes = torch.export.Dim("scenes", min=1)
     program = torch.export.export(Joined(), given(3), dynamic_shapes=tuple({0: scenes} for _ in range(5))).module()
@@ -189,9 +192,9 @@ def test_a_program_takes_any_number_of_scenes() -> None:
         found = program(*arguments)
         for one, wanted in zip(found, Joined()(*arguments), strict=True):
             assert torch.equal(one, wanted)
-        states, controls, energy, _ = found
+        states, controls, norm, _ = found
         assert torch.equal(states[:, 0], states[:, 2])
-        assert torch.equal(energy[:, 0], torch.minimum(arguments[2][:, 0], arguments[2][:, 2]))
+        assert torch.equal(norm[:, 0], torch.minimum(arguments[2][:, 0], arguments[2][:, 2]))
         first = arguments[2][:, 0] <= arguments[2][:, 2]
         assert torch.equal(controls[first, 2], arguments[1][first, 0])
         assert torch.equal(controls[~first, 0], arguments[1][~first, 2])
