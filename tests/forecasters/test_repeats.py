@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from epo_lightning.forecast import DISTINCT, Solution, same_motion
 from epo_lightning.forecasters import epo
-from epo_lightning.forecasters.repeats import earliest_same, smallest_of_same, repeats_joined, with_repeats_added
+from epo_lightning.forecasters.repeats import earliest_same, repeats_joined, smallest_of_same, with_repeats_added
 from epo_lightning.metrics.functional import brier_min_sade
 
 
