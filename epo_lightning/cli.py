@@ -320,15 +320,15 @@ def _sweep(arguments: Arguments) -> None:
     """Run, prepare, show or list sweeps, as ``SWEEP_USAGE`` describes."""
     from textwrap import fill
 
-    from epo_lightning.experiment.sweeps import sweeping
+    from epo_lightning.experiment.sweeps import listing
 
     words = list(arguments.overrides)
     action = words.pop(0) if words[:1] in (["status"], ["generate"]) else "run"
     name = words.pop(0) if words and "=" not in words[0] else None
     if action == "status":
-        sweeping.show(name, words)
+        listing.show(name, words)
         return
-    known = sweeping.known(arguments.extra)
+    known = listing.known(arguments.extra)
     if name is None:
         if words or action == "generate":
             command = " ".join(["epo sweep", *([action] if action == "generate" else []), "<name>", *words])
@@ -338,7 +338,9 @@ def _sweep(arguments: Arguments) -> None:
             print(fill(says, 120, initial_indent=f"  {option:<{width}}", subsequent_indent=" " * (width + 2)))
         return
     if name not in known:
-        raise ConfigError(sweeping.unknown(name, known))
+        raise ConfigError(listing.unknown(name, known))
+    from epo_lightning.experiment.sweeps import sweeping
+
     if action == "generate":
         sweeping.generate(name, words, arguments.extra)
         return
@@ -368,8 +370,9 @@ def job_of_sweep(config: DictConfig, options: Sequence[str] = ()) -> float | Non
     values, overrides = resolve(whole), list(HydraConfig.get().overrides.task)  # type: ignore[arg-type]
     if values.get("sweep"):
         from epo_lightning.experiment.sweeps.sweep import Sweep
+        from epo_lightning.experiment.sweeps.work import work
 
-        return Sweep(Path(values["sweep"])).work(values, overrides, options)
+        return work(Sweep(Path(values["sweep"])), values, overrides, options)
     return verbs.train_and_print(values, [*overrides, *options])
 
 

@@ -75,7 +75,7 @@ FLOORS = {
         "report",
         "run_folder",
     },
-    "report": {"scene", "forecast", "registry", "metrics", "run_folder", "identity", "masking"},
+    "report": {"scene", "forecast", "registry", "run_folder", "identity", "masking"},
 }
 """Top-level modules that each one may import besides itself; `experiment` and `cli` may import all."""
 

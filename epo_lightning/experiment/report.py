@@ -2,33 +2,23 @@
 
 from __future__ import annotations
 
-import math
 import os
 import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from epo_lightning.experiment import assembly
-from epo_lightning.experiment.config.settings import ReportSettings, Settings
-from epo_lightning.experiment.opening import open_checkpoint, open_data, settings_of
-from epo_lightning.experiment.pictures import choose, eventful, forecast_of, is_traffic, pairs, spread
+from epo_lightning.experiment.config.settings import ReportSettings
 from epo_lightning.experiment.sweeps.sweep import Sweep
 from epo_lightning.identity import ELSEWHERE
 from epo_lightning.registry import ConfigError
-from epo_lightning.report import EvaluatedRun, Report, build_tables, collect, write_report
 from epo_lightning.report.paper import has_values
 from epo_lightning.report.render import code
 from epo_lightning.report.results import read_results, results_name, save_results
-from epo_lightning.report.rows import Row
-from epo_lightning.report.runs import scored, scored_elsewhere
-from epo_lightning.report.tables import distinct
-from epo_lightning.report.write import is_measured, is_timed, why_left_out
-from epo_lightning.run_folder import RunFolder
+from epo_lightning.report.runs import EvaluatedRun, collect, scored, scored_elsewhere
+from epo_lightning.report.tables import build_tables, distinct
+from epo_lightning.report.write import Report, is_measured, is_timed, why_left_out, write_report
 
-SCENES, GAMES = 4, 512
-"""How many scenes are drawn, and over how many the distribution of learned weights is taken."""
 RESULTS = "results"
 """Folder of the results files of a template, unless another one is named."""
 NOT_DRAWN = "Scenes and learned weights are not drawn: they need checkpoints and data."
@@ -43,7 +33,6 @@ def report(settings: ReportSettings) -> Path:
     Raises:
         ConfigError: no such sweep, no evaluated run, one that cannot be read, or a damaged results file.
     """
-    assembly.quiet()
     if settings.results and settings.sweep:
         raise ConfigError(
             f"results={settings.results} and the sweep {settings.sweep} name different runs: give one of them"
@@ -60,6 +49,8 @@ def report(settings: ReportSettings) -> Path:
     if settings.save:
         save_results(subject, settings.save)
     if settings.scenes and not settings.results:
+        from epo_lightning.experiment.report_scenes import draw  # all else is written without Lightning
+
         drawn, notes = draw(rows, out / "figures")
     else:
         drawn, notes = [], [NOT_DRAWN] if rows else []
@@ -166,75 +157,3 @@ def _words(command: str) -> list[str]:
 
 def _matters(word: str) -> bool:
     return word.lstrip("+").partition("=")[0] not in ELSEWHERE
-
-
-def draw(rows: Iterable[Row], folder: Path) -> tuple[list[Path], list[str]]:
-    """The joint predictions of rows over the same scenes, and the weights of the games they inferred.
-
-    Every row is drawn by its first run, and of rows with the same title the best is. Rows that were trained on other data
-    than the first one are not drawn.
-
-    Returns:
-        the pictures, and notes on what could not be drawn.
-    """
-    from epo_lightning.report.figures import joint_predictions
-    from epo_lightning.report.scenes import highway_comparison
-    from epo_lightning.report.style import AGENTS
-    from epo_lightning.report.weights import learned_weights
-
-    runs: dict[str, tuple[RunFolder, Settings]] = {}
-    forecasters: dict[str, Any] = {}
-    notes = []
-    for row in _best_of_titles(rows):
-        run = RunFolder(row.runs[0].path)
-        try:
-            settings = settings_of(run)
-            forecasters[row.name] = open_checkpoint(settings, run.checkpoint())
-            runs[row.name] = run, settings
-        except ConfigError as error:
-            notes.append(f"{row.name} is not drawn: {error}")
-    if not runs:
-        return [], notes
-    try:
-        first = next(iter(runs))
-        data, shape = open_data(*runs[first]), forecasters[first].task.shape
-        # Records with two futures (RPI) are found among all scenes only.
-        scenes, _ = choose(data, "test", None if "alternative" in data.task.subsets else GAMES)
-    except ConfigError as error:
-        return [], [*notes, f"No scenes are drawn: {error}"]
-    folder.mkdir(parents=True, exist_ok=True)
-    drawn: list[Path] = []
-    if is_traffic(scenes, shape):
-        for number, index in enumerate(eventful(scenes, SCENES), 1):
-            forecasts = {title: forecast_of(forecaster, scenes[index]) for title, forecaster in forecasters.items()}
-            drawn.append(highway_comparison(scenes[index], forecasts, folder / f"scene_{number}.png"))
-    else:
-        shown, others = pairs(scenes, SCENES)
-        other = None if others is None or scenes.future is None else scenes.future[others]
-        forecasts = {title: forecast_of(forecaster, scenes[shown]) for title, forecaster in forecasters.items()}
-        drawn.append(joint_predictions(scenes[shown], forecasts, folder / "joint_predictions.png", other))
-    many = spread(scenes, GAMES)
-    # An energy may be a network, without weights that have names.
-    inferred = {title: forecast.parameters for title, forecast in forecasts.items()}
-    weighted = [title for title, game in inferred.items() if game is not None and game.own_weights]
-    games = {title: forecast_of(forecasters[title], many) for title in weighted}
-    if games:
-        names = () if is_traffic(scenes, shape) else AGENTS
-        drawn.append(learned_weights(games, folder / "learned_weights.png", names))
-    return drawn, notes
-
-
-def _best_of_titles(rows: Iterable[Row]) -> list[Row]:
-    """Rows that saw the data of the first one; of those with the same title, which differ in settings, the best."""
-    best: dict[str, Row] = {}
-    for row in rows:
-        first = next(iter(best.values()), row)
-        other = best.get(row.title, row)
-        if row.runs[0].trained_digest == first.runs[0].trained_digest and _score(row) <= _score(other):
-            best[row.title] = row
-    return list(best.values())
-
-
-def _score(row: Row) -> float:
-    cell = row.cells.get("minSADE")
-    return math.inf if cell is None or math.isnan(cell.mean) else cell.mean

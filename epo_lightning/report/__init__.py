@@ -1,7 +1,4 @@
-"""Runs -> tables with the paper's values beside (here) and figures (in ``figures``, which needs matplotlib)."""
+"""Runs -> tables with the paper's values beside (``tables``), pages (``write``) and figures (``figures``, with matplotlib).
 
-from epo_lightning.report.runs import EvaluatedRun, collect
-from epo_lightning.report.tables import build_tables
-from epo_lightning.report.write import Report, write_report
-
-__all__ = ["EvaluatedRun", "Report", "build_tables", "collect", "write_report"]
+This file imports nothing: labels of settings are needed by commands that must not wait for matplotlib.
+"""

@@ -48,6 +48,8 @@ class Column:
         return f"{value:.6g}" if self.metric in GAME and not math.isnan(value) else number(value, 6)
 
 
+INTERACTIVE = "interactive"
+"""Name of the subset of scenes in which agents interact (:data:`epo_lightning.metrics.functional.interaction.SUBSETS`)."""
 PAIR_EFFECT = "pair_effect"
 """Metric of the displacement [m] that the pair terms of a game make."""
 OWN_UNITS = ("energy_initial", "energy_solved", "energy_optimum", "gradient_norm", "nash_gap")

@@ -10,10 +10,10 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
-from epo_lightning.metrics.functional.interaction import INTERACTIVE
 from epo_lightning.report.columns import (
     ALTERNATIVES,
     EQUILIBRIUM,
+    INTERACTIVE,
     MAIN,
     OF_ALTERNATIVES,
     OF_MODES,

@@ -15,7 +15,7 @@ from epo_lightning.arguments import parse
 from epo_lightning.experiment import assembly, verbs
 from epo_lightning.experiment.config import compose
 from epo_lightning.experiment.config.settings import Settings
-from epo_lightning.experiment.sweeps import sweeping
+from epo_lightning.experiment.sweeps import listing, sweeping
 from epo_lightning.schema import read
 
 NOT_RUN = {
@@ -66,12 +66,12 @@ def composes(words: list[str]) -> None:
             return
         name, *overrides = overrides
         name = name.partition("-")[0]
-        assert name in sweeping.known(arguments.extra), name
+        assert name in listing.known(arguments.extra), name
         kept = [word for word in overrides if not word.startswith((sweeping.CHOICES, "workers="))]
         verb, overrides = "train", sweeping.words_of(name, kept, arguments.extra)
         arguments.multirun = True
     if verb == "report" and overrides and "=" not in overrides[0]:
-        assert overrides.pop(0) in sweeping.known(arguments.extra)
+        assert overrides.pop(0) in listing.known(arguments.extra)
     if verb in ("generate", "evaluate") and arguments.multirun:
         overrides = compose.jobs(verb, overrides, arguments.extra)[0]
     if verb != "train":

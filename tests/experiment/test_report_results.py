@@ -17,8 +17,8 @@ from report.test_transfer import three_runs
 from epo_lightning.experiment.config.settings import ReportSettings
 from epo_lightning.experiment.report import NOT_DRAWN, report
 from epo_lightning.registry import ConfigError
-from epo_lightning.report import Report
 from epo_lightning.report.results import _digest, save_results
+from epo_lightning.report.write import Report
 from epo_lightning.run_folder import RunFolder
 
 FILES = {

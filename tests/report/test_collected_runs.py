@@ -15,11 +15,11 @@ from rich.console import Console
 
 from epo_lightning.identity import identity, row_identity
 from epo_lightning.registry import ConfigError
-from epo_lightning.report import Report, write_report
 from epo_lightning.report.rows import Row, of_different_code, untaught
 from epo_lightning.report.runs import collect, find_runs
 from epo_lightning.report.statistics import build_comparisons
 from epo_lightning.report.tables import build_tables, distinct, over_folds
+from epo_lightning.report.write import Report, write_report
 from epo_lightning.run_folder import RunFolder, write_json
 from report.table_rows import rows_of
 

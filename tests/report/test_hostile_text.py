@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from epo_lightning.report import Report, write_report
 from epo_lightning.report.render import code
 from epo_lightning.report.style import save
+from epo_lightning.report.write import Report, write_report
 
 from .page_runs import write_log
 from .run_folders import make_run, scores

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from epo_lightning.report import Report, write_report
 from epo_lightning.report.charts import charts_of
 from epo_lightning.report.columns import Column, significant
 from epo_lightning.report.costs import cost_sheets, last_fifth
@@ -20,6 +19,7 @@ from epo_lightning.report.render import legend, to_markdown
 from epo_lightning.report.runs import collect, find_runs
 from epo_lightning.report.tables import Table, build_tables
 from epo_lightning.report.timings import duration, read_timings
+from epo_lightning.report.write import Report, write_report
 from epo_lightning.run_folder import read_json, write_json
 
 from .methods import METHODS, PARTS, of_methods, time_it

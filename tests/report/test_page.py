@@ -15,8 +15,8 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
-from epo_lightning.report import Report, write_report
 from epo_lightning.report.page import picture_uri
+from epo_lightning.report.write import Report, write_report
 
 from .page_runs import over_runtime, over_steps, rows_with_seeds
 from .run_folders import make_run, scores

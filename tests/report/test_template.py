@@ -13,10 +13,10 @@ from scipy.stats import t as student
 from epo_lightning.experiment.config.settings import ReportSettings
 from epo_lightning.experiment.report import report_page
 from epo_lightning.registry import ConfigError
-from epo_lightning.report import Report
 from epo_lightning.report.results import read_results, save_results
 from epo_lightning.report.scores import Differences, Scores, average, below, table
 from epo_lightning.report.template import Results, write_page
+from epo_lightning.report.write import Report
 
 from .run_folders import make_run
 from .run_folders import scores as make_scores

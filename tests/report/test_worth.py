@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from epo_lightning.identity import differences
-from epo_lightning.report import Report, write_report
 from epo_lightning.report.rows import Row, plain_rows
 from epo_lightning.report.runs import collect, read_run
 from epo_lightning.report.tables import build_tables
 from epo_lightning.report.worth import LEGEND, build_worth, twins
+from epo_lightning.report.write import Report, write_report
 from epo_lightning.run_folder import RunFolder
 
 from .run_folders import make_run, scores

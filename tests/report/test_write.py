@@ -15,7 +15,7 @@ from PIL import Image
 from rich.console import Console
 
 from epo_lightning.registry import ConfigError
-from epo_lightning.report import Report, write_report
+from epo_lightning.report.write import Report, write_report
 from epo_lightning.run_folder import write_json
 
 from .page_runs import over_runtime, over_steps, rows_with_seeds

@@ -141,15 +141,15 @@ def _refuse_ignored(values: Mapping[str, Any], overrides: Iterable[str]) -> None
     Raises:
         ConfigError: an override sets or chooses a part, and the forecaster takes none.
     """
-    name = str(_name(values, "forecaster"))
-    chosen = parts("forecaster").get(name)
+    settings = re.compile(rf"[+~]*((?!solver\.backend=)({'|'.join(OF_GAMES)})(?:[.=].*)?)")
+    given = [match for word in overrides if (match := settings.fullmatch(word))]
+    # Forecasters are imported with Lightning, which takes seconds: only where there is something to check.
+    chosen = parts("forecaster").get(name := str(_name(values, "forecaster"))) if given else None
     if chosen is None:
         return
     own, section = inspect.signature(chosen).parameters, values["forecaster"]
-    ignored = "|".join(part for part in OF_GAMES if part not in own)
-    settings = re.compile(rf"[+~]*((?!solver\.backend=)({ignored})(?:[.=].*)?)")
-    given = [match for word in overrides if (match := settings.fullmatch(word))]
-    if not ignored or not given:
+    given = [match for match in given if match.group(2) not in own]
+    if not given:
         return
     part = given[0].group(2)
     key, _, value = given[0].group(1).removeprefix("objective.").partition("=")

@@ -16,29 +16,21 @@ same folders as without a sweep, so that a run that belongs to two sweeps is tra
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import os
 import socket
 import time
-import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from epo_lightning.experiment import assembly
-from epo_lightning.experiment import train as training
-from epo_lightning.experiment.config.settings import Measured, Settings, measures
-from epo_lightning.experiment.sweeps.orphans import end_with
-from epo_lightning.identity import identity
+from epo_lightning.experiment.config.settings import Measured, measures
 from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.entries import OBJECT, OBJECTS, TEXT, TEXTS, WHOLE, Check, check_entries, check_known
-from epo_lightning.report.runs import data_name
 from epo_lightning.run_folder import LOCK, RunFolder, read_json, write_file, write_json
-from epo_lightning.schema import read
 
 State = Literal["done", "running", "interrupted", "trained, not scored", "failed", "waiting"]
 BESIDE = (
@@ -61,10 +53,6 @@ _JOB = {"overrides": TEXTS, "folder": TEXT, "identity": TEXT, "title": TEXT, "se
 _SCORE: Check = ("a list of texts", lambda value: value is None or TEXT[1](value) or TEXTS[1](value))
 
 
-class RunFailed(RuntimeError):
-    """Error for a failed run of a sweep. It has only a message, so that it can be sent to another process."""
-
-
 @dataclass(frozen=True)
 class Job:
     """One run of a sweep.
@@ -85,21 +73,6 @@ class Job:
     seed: int
     measures: tuple[Measured, ...]
     data: str = ""
-
-    @classmethod
-    def of(cls, config: Mapping[str, Any], overrides: Sequence[str]) -> Job:
-        """The job of a resolved configuration, after a check of the configuration; writes no file.
-
-        Raises:
-            ConfigError: as :func:`assembly.check_buildable`.
-        """
-        settings = read(Settings, config)
-        data, _ = assembly.check_buildable(settings, overrides)
-        run = training.folder_for(settings)
-        name = identity(config, data.digest)
-        return cls(
-            tuple(overrides), run, name, settings.title, settings.seed, settings.measures, data_name(settings.data)
-        )
 
     @property
     def lacking(self) -> tuple[Measured, ...]:
@@ -229,6 +202,11 @@ class Sweep:
         except ConfigError as error:
             return str(error)
 
+    @property
+    def has_failures(self) -> bool:
+        """Whether a run has failed since the last start of the sweep."""
+        return any((self.folder / "failures").glob("*.txt"))
+
     def _failure(self, run: RunFolder) -> Path:
         return self.folder / "failures" / f"{self._place(run).replace(os.sep, '__')}.txt"
 
@@ -294,46 +272,13 @@ class Sweep:
         }
         write_json(self.folder / "sweep.json", content)
 
-    def lost(self, job: Job) -> None:
-        """Record that the process of a run died without an error message."""
-        write_file(self._failure(job.run), "its process was killed in every attempt (out of memory?)\n")
+    def add(self, job: Job) -> None:
+        """Record a run that a searching sweep has chosen."""
+        write_json(self.folder / "found" / self._failure(job.run).with_suffix(".json").name, self._entry(job))
 
-    def work(self, config: Mapping[str, Any], overrides: Sequence[str], options: Sequence[str]) -> float | None:
-        """Train and score one of the runs. A launcher calls this in a process of its choice.
-
-        Args:
-            config: configuration of the run.
-            overrides: overrides of the run.
-            options: options of the sweep's command line, which the run's record repeats.
-
-        Returns:
-            the best validation score; None for a run that is skipped because another one failed (``--stop-on-failure``).
-
-        Raises:
-            RunFailed: the run failed; the sweep's folder holds the traceback.
-        """
-        record = self.record
-        # A worker on another machine may have another working folder and other environment variables.
-        with contextlib.suppress(OSError):
-            os.chdir(record["directory"])
-        if record["cache"]:
-            os.environ.setdefault("EPO_CACHE", record["cache"])
-        if record["stop_on_failure"] and any((self.folder / "failures").glob("*.txt")):
-            return None
-        end_with(record["process"])
-        settings = read(Settings, config)
-        run = training.folder_for(settings)
-        try:
-            if not record["jobs"]:
-                name = self._failure(run).with_suffix(".json").name
-                write_json(self.folder / "found" / name, self._entry(Job.of(config, overrides)))
-            training.train(dict(config), [*overrides, *options])
-        except Exception as error:
-            message = mask(f"{type(error).__name__}: {' '.join(str(error).split())}")
-            message = message.replace(f"{self.root}{os.sep}", f"{os.path.relpath(self.root)}{os.sep}")
-            write_file(self._failure(run), f"{message}\n\n{mask(traceback.format_exc())}")
-            raise RunFailed(f"{settings.title}, seed {settings.seed}: {message}") from None
-        return next(iter(run.record.get("best", {}).values()), None)
+    def fail(self, run: RunFolder, message: str, trace: str = "") -> None:
+        """Record that a run has failed: its error in one line, and the traceback."""
+        write_file(self._failure(run), f"{message}\n" + (f"\n{trace}" if trace else ""))
 
 
 def _content(file: Path) -> dict[str, Any]:

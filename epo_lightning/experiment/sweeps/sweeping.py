@@ -1,13 +1,12 @@
-"""``epo sweep``: list the runs that are not done, run them by a launcher, and print the results."""
+"""``epo sweep <name>``: list the runs that are not done, run them by a launcher, and print the results."""
 
 from __future__ import annotations
 
 import json
 import os
-import shlex
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +15,13 @@ from epo_lightning.experiment import assembly
 from epo_lightning.experiment import train as training
 from epo_lightning.experiment.config import compose
 from epo_lightning.experiment.config.settings import Settings, TrainerSettings
-from epo_lightning.experiment.config.sources import GROUP, file_of, options_of
+from epo_lightning.experiment.config.sources import options_of
 from epo_lightning.experiment.provenance import of_other_code
+from epo_lightning.experiment.sweeps.listing import command_line, folder_of_runs
 from epo_lightning.experiment.sweeps.sweep import Job, State, Sweep
 from epo_lightning.experiment.sweeps.watch import news, note_former, status, summary
+from epo_lightning.experiment.sweeps.work import job_of
 from epo_lightning.experiment.verbs import check_settings, make_data
-from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.report.choices import Choices, read_choices
 from epo_lightning.report.entries import TEXT, WHOLE, check_entries
@@ -36,6 +36,8 @@ CHOICES = "choices="
 """Beginning of the override that names a choices file (:mod:`epo_lightning.report.choices`)."""
 ATTEMPTS = 3
 """Number of times that the launcher of a sweep is started, if it breaks down."""
+KILLED = "its process was killed in every attempt (out of memory?)"
+"""Error of a run whose process died without a message."""
 PAUSE = 5.0
 """Seconds between two looks at runs that still run after their launcher broke down."""
 
@@ -60,7 +62,7 @@ def run(
     """
     assembly.quiet()
     _refuse_places(overrides)
-    runs = _runs(overrides)
+    runs = folder_of_runs(overrides)
     sweep = Sweep.of(name, overrides, runs)
     choices, others = _choices_in(overrides)
     words = words_of(name, others, extra)
@@ -71,13 +73,13 @@ def run(
     try:
         jobs = _listed(sweep, words, extra, choices)
     except CacheError as error:
-        command = _command(["epo", "sweep", "generate", name, *overrides], extra)
-        raise ConfigError(f"{error}; or make all data sets of the sweep with `{command}`") from error
+        again = command_line(["epo", "sweep", "generate", name, *overrides], extra)
+        raise ConfigError(f"{error}; or make all data sets of the sweep with `{again}`") from error
     with sweep.lock():
         states = [sweep.state(job) for job in jobs]
         sweep.begin(
             name,
-            _command(["epo", "sweep", name, *overrides], extra),
+            command_line(["epo", "sweep", name, *overrides], extra),
             overrides,
             jobs,
             stop_on_failure,
@@ -146,12 +148,7 @@ def generate(name: str, overrides: Sequence[str], extra: Sequence[str]) -> None:
     for number, section in enumerate(sections.values(), 1):
         print(f"\ndata set {number} of {len(sections)}", flush=True)
         make_data(check_settings("generate", {**making, "data": section}))
-    print(f"\nnext: {_command(['epo', 'sweep', name, *others], extra)}")
-
-
-def _command(words: Sequence[str], extra: Sequence[str]) -> str:
-    """A command line as a user would give it, without passwords."""
-    return shlex.join(mask([*words, *(f"--config-dir={folder}" for folder in extra)]))
+    print(f"\nnext: {command_line(['epo', 'sweep', name, *others], extra)}")
 
 
 def _overrides_of_runs(words: Sequence[str], choices: Choices | None, extra: Sequence[str]) -> list[list[str]]:
@@ -202,7 +199,7 @@ def _listed(sweep: Sweep, words: Sequence[str], extra: Sequence[str], choices: C
     scored: dict[str, list[dict[str, Any]]] = {}
     for overrides in _overrides_of_runs(words, choices, extra):
         config = compose.compose("train", overrides, extra)
-        job = Job.of(config, overrides)
+        job = job_of(config, overrides)
         if job.run.record_file.is_file():
             training.refuse_other(job.run, config, assembly.build_data(config["data"]))
         elif job.run.exists:
@@ -317,7 +314,7 @@ def _launch(
             print(f"{len(left)} runs are left", flush=True)
     for job in left:
         if sweep.state(job) in ("interrupted", "trained, not scored"):
-            sweep.lost(job)
+            sweep.fail(job.run, KILLED)
 
 
 def _said(error: Exception) -> str:
@@ -345,52 +342,3 @@ def _search(sweep: Sweep, words: Sequence[str], task: Callable[..., Any], extra:
         print(f"the search ended early ({_said(error)})", flush=True)
         return False
     return True
-
-
-def known(extra: Sequence[str] = ()) -> dict[str, str]:
-    """The names of all sweeps, and the description with which each file begins."""
-    says = {}
-    with compose.hydra(extra) as instance:
-        for option in options_of(instance, GROUP):
-            lines = Path(file_of(instance, GROUP, option)).read_text(encoding="utf-8").splitlines()
-            says[option] = _description([line for line in lines if line.startswith("#") and "@package" not in line])
-    return says
-
-
-def unknown(name: str, names: Collection[str]) -> str:
-    """The error message for a sweep that is not among the known ones: the nearest name, or the folder that has its file."""
-    option = Path(name).stem
-    for home in (Path(name).parent.parent, Path("conf")):
-        if option not in names and (file := home / GROUP / f"{option}.yaml").is_file():
-            return f"unknown sweep {name!r}: {file} is found by `{_command(['epo', 'sweep', option], [str(home)])}`"
-    return f"unknown sweep {name!r}: {nearest(option, names)}"
-
-
-def _description(comments: Sequence[str]) -> str:
-    """The first sentence of comment lines: up to a line that ends with a full stop or colon, or up to an example command."""
-    text = ""
-    for line in comments:
-        text, _, command = f"{text} {line.lstrip('# ')}".strip().partition(":  ")
-        if command or text.endswith((":", ".", "?", "!")):
-            break
-    return text.rstrip(":")
-
-
-def show(name: str | None, overrides: Sequence[str]) -> None:
-    """Print the state of every run of a sweep that has begun; without a name, a summary of every sweep.
-
-    Raises:
-        ConfigError: no sweep with that name and overrides has begun.
-    """
-    runs = _runs(overrides)
-    if name is not None:
-        status(Sweep.find(name, overrides, runs))
-        return
-    for sweep in Sweep.begun(runs):
-        counts = Counter(sweep.state(job) for job in sweep.jobs)
-        print(f"{sweep.label}: {summary(counts)}\n    {sweep.record.get('command', '')}")
-
-
-def _runs(overrides: Sequence[str]) -> str:
-    """The folder below which runs are written: the override ``runs``, parsed by Hydra, or its default."""
-    return str(compose.compose("train", [given for given in overrides if given.startswith("runs=")])["runs"])

@@ -18,8 +18,8 @@ from epo_lightning.data.rpi.scenes import RPIData
 from epo_lightning.experiment.sweeps import sweeping
 from epo_lightning.experiment.sweeps.sweep import Sweep
 from epo_lightning.registry import ConfigError
-from epo_lightning.report import Report, write_report
 from epo_lightning.report.choices import read_choices
+from epo_lightning.report.write import Report, write_report
 
 MAIN = ("sweep", "rpi_main", *TINY, "seed=0", "experiment=rpi/const_vel,rpi/v_lstm", "score=val")
 

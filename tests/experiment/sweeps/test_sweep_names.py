@@ -17,6 +17,7 @@ from epo_lightning.experiment.config.compose import compose, jobs
 from epo_lightning.experiment.sweeps.sweep import Job, Sweep, label
 from epo_lightning.experiment.sweeps.sweeping import _listed
 from epo_lightning.experiment.sweeps.watch import _scoring, how_far, names_of, result
+from epo_lightning.experiment.sweeps.work import job_of
 from epo_lightning.identity import identity
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, write_json
@@ -183,7 +184,7 @@ def test_a_sweep_over_two_data_sets_records_their_names(tmp_path: Path) -> None:
     rows = ("table1/rpi_jfp", "table1/highway_jfp")
     words = [["data=drawn", "budget=smoke", f"experiment={row}"] for row in rows]
     sweep = Sweep(tmp_path / "sweeps" / "table1")
-    sweep.begin("table1", "epo sweep table1", [], [Job.of(compose("train", word), word) for word in words], False)
+    sweep.begin("table1", "epo sweep table1", [], [job_of(compose("train", word), word) for word in words], False)
     names = list(names_of(sweep.jobs).values())
     assert names == ["JFP (drawn (rpi)), seed 0", "JFP (drawn (highway)), seed 0"]
 
