@@ -19,6 +19,7 @@ from lightning.pytorch import callbacks as of_lightning
 from lightning.pytorch.callbacks import TQDMProgressBar
 
 from epo_lightning.experiment.config.settings import CallbackSettings
+from epo_lightning.forecasters.step_means import StepMeans
 from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.run_folder import RunFolder, write_json
 
@@ -189,7 +190,8 @@ class EpochLines(Callback):
         metrics = trainer.callback_metrics
         value = float(metrics.get(self._monitor, math.nan))
         self._best = min(self._best, value) if not math.isnan(value) else self._best
-        loss = float(metrics.get("train/loss", math.nan))
+        means: StepMeans = pl_module.step_means  # type: ignore[assignment]
+        loss = float(means.means().get("train/loss", math.nan))
         epochs = f"/{trainer.max_epochs}" if trainer.max_epochs and trainer.max_epochs > 0 else ""
         print(
             f"{self._title}: epoch {trainer.current_epoch + 1}{epochs}, step {trainer.global_step}, loss {loss:.4f}, "

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from epo_lightning import doubts
 from epo_lightning.decoders.weights import SharedWeights
 from epo_lightning.forecast import JointForecast
+from epo_lightning.forecasters.step_means import StepMeans
 from epo_lightning.losses import Schedule, schedules_in
 from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.metrics.forecast import COLUMNS, STOPPED, stopped
@@ -57,6 +58,7 @@ class Forecaster(LightningModule):
         self._plausible = 0  # number of batches whose motions `predict` has found plausible
         self.task = task
         self.optimizer = optimizer
+        self.step_means = StepMeans()
         self.val_metrics = ForecastMetrics(task.subsets, task.shape)
         self.test_metrics = ForecastMetrics(task.subsets, task.shape)
 
@@ -137,10 +139,15 @@ class Forecaster(LightningModule):
     def training_step(self, scene: Scene, _: int) -> Tensor:
         self._check_dt(scene)
         total, terms = (self.step_graph or self.weighted_losses)(scene)
-        size = len(scene.history)
-        values = {"train/loss": total.detach(), **{f"train/{name}": value for name, value in terms.items()}}
-        self.log_dict(values, on_step=False, on_epoch=True, batch_size=size, sync_dist=True)
+        values = {"train/loss": total, **{f"train/{name}": value for name, value in terms.items()}}
+        self.step_means.add(values, len(scene.history))
         return total
+
+    def on_train_epoch_start(self) -> None:
+        self.step_means.reset()
+
+    def on_train_epoch_end(self) -> None:
+        self.log_dict(self.step_means.means(), batch_size=self.step_means.scenes, sync_dist=True)
 
     def backward(self, loss: Tensor, *args: Any, **kwargs: Any) -> None:
         """Backward pass; nothing is left to do if the gradients have come with the loss (``step_graph``)."""

@@ -9,7 +9,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 COMMANDS = (
     ["train", "--help"],
-    ["config", "experiment=rpi/v_lstm_epo", "data=rpi_hard", "budget=short"],
+    ["config", "experiment=rpi/v_lstm_epo", "data=rpi_hard"],
     ["sweep"],
     ["report", f"results={ROOT / 'results' / 'game.json'}"],
 )
@@ -19,7 +19,7 @@ from epo_lightning.cli import main
 from epo_lightning.experiment.sweeps import listing
 for words in {COMMANDS!r}:
     main(words)
-listing.status
+assert listing
 assert "numpy" in sys.modules, "the report has figures"
 print("heavy:", sorted({{"torch", "lightning", "torchmetrics"}} & set(sys.modules)))
 """

@@ -68,9 +68,8 @@ class Losses(lightning.Callback):
     def __init__(self) -> None:
         self.epochs: list[dict[str, float]] = []
 
-    def on_train_epoch_end(self, trainer: lightning.Trainer, _: Any) -> None:
-        logged = trainer.callback_metrics.items()
-        self.epochs.append({name: float(value) for name, value in logged if name.startswith("train/")})
+    def on_train_epoch_end(self, _: lightning.Trainer, module: Forecaster) -> None:  # type: ignore[override]
+        self.epochs.append({name: float(value) for name, value in module.step_means.means().items()})
 
 
 @pytest.fixture

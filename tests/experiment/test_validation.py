@@ -13,6 +13,7 @@ from experiment.conftest import TINY, Epo
 from epo_lightning.experiment import assembly, callbacks
 from epo_lightning.experiment.config.compose import compose
 from epo_lightning.experiment.config.settings import Settings
+from epo_lightning.forecasters.step_means import StepMeans
 from epo_lightning.metrics.forecast import EQUILIBRIUM_METRICS
 from epo_lightning.run_folder import RunFolder, read_json, read_log
 from epo_lightning.schema import read
@@ -88,14 +89,16 @@ def test_progress_lines_of_a_resumed_run_know_its_best_score(
     kept.best_model_score = torch.tensor(0.1)
     trainer: Any = SimpleNamespace(
         checkpoint_callbacks=[kept],
-        callback_metrics={"val/minSADE": torch.tensor(0.3), "train/loss": torch.tensor(1.0)},
+        callback_metrics={"val/minSADE": torch.tensor(0.3)},
         current_epoch=4,
         max_epochs=9,
         global_step=50,
     )
+    model: Any = SimpleNamespace(step_means=StepMeans())
+    model.step_means.add({"train/loss": torch.tensor(1.0)}, 32)
     lines = callbacks.EpochLines("a run", "val/minSADE")
     for hook in (lines.on_train_start, lines.on_validation_end, lines.on_train_epoch_end):
-        hook(trainer, torch.nn.Identity())  # type: ignore[arg-type]
+        hook(trainer, model)
     assert "epoch 5/9, step 50, loss 1.0000, val/minSADE 0.3000 (best 0.1000)" in capsys.readouterr().out
 
 
