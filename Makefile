@@ -1,7 +1,7 @@
 # make run         from a bare machine to a first table with pictures: six to nine minutes on 2 cores, installation included
 # make install     the package and its command `epo` in .venv (`make run` does it)
 # make dev         install what the tests and checks need as well
-# make test        install everything and run the tests      make test-slow   the tests that take minutes
+# make test        install everything and run the tests      make test-slow   the tests that take long
 # make lint        check style and types
 # make smoke       train every experiment for a few steps on drawn scenes (a minute)
 # make docs        build the documentation as a site, with references of API and configuration, in build/docs

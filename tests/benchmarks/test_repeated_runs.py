@@ -16,6 +16,7 @@ from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder, write_json
 
 
+@pytest.mark.slow
 def test_a_run_of_a_results_file_is_trained_again(capsys, tmp_path):
     small = [f"data.root={tmp_path}", "data.games=3", "data.placements=1", "data.sizes=null", "callbacks.progress=none"]
     RPIData(root=str(tmp_path), games=3, placements=1, sizes=None, recipe=2).generate(workers=1, progress=False)

@@ -217,6 +217,7 @@ else:
 """
 
 
+@pytest.mark.slow
 def test_a_network_is_told_the_weight_of_the_game(tmp_path):
     """In a process of its own, because the program registers a data set and a backbone."""
     RPIData(root=str(tmp_path), games=3, placements=1, sizes=None, recipe=2).generate(workers=1, progress=False)

@@ -29,6 +29,7 @@ QUICK = [
 ]
 
 
+@pytest.mark.slow
 def test_tables_and_films_are_written(epo: Callable[..., int], tmp_path: Path) -> None:  # noqa: F811
     words = ["run=[rpi/v_lstm_epo,rpi/v_lstm_sc]", "ways=[own,warm]", "baselines=[constant_velocity]"]
     assert epo("drive", *words, *SMALL, f"out={tmp_path}/driven") == 0

@@ -35,6 +35,7 @@ def test_every_fold_has_a_data_set_a_run_and_a_table(epo: Epo, tmp_path: Path) -
     assert len({*row.values("SADE")}) == 2, "the folds have different scenes"
 
 
+@pytest.mark.slow
 def test_each_data_set_of_several_is_made_by_the_jobs_of_a_launcher(epo: Epo, tmp_path: Path) -> None:
     for place in range(4):
         folder = pedestrians.square(tmp_path / "data", f"square{place}", seed=place)

@@ -39,8 +39,7 @@ def test_the_rows_are_the_papers_and_those_of_other_games() -> None:
 
 
 @pytest.mark.parametrize("data", HIGHWAYS)
-@pytest.mark.parametrize("row", ["vibes_epo", "v_lstm_epo_no_goal"])
-@pytest.mark.parametrize("budget", ["paper", "short"])
+@pytest.mark.parametrize(("row", "budget"), [("vibes_epo", "paper"), ("v_lstm_epo_no_goal", "short")])
 def test_both_names_of_a_row_are_the_same_run(data: str, row: str, budget: str) -> None:
     new = compose("train", [f"experiment=highway/{row}", f"data={data}", f"budget={budget}"])
     old = compose("train", [f"experiment={data}/{row}", f"budget={budget}"])

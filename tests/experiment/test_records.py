@@ -224,6 +224,7 @@ def test_a_full_disk_keeps_the_previous_report(epo: Epo, capsys: pytest.CaptureF
     assert content("report") == before
 
 
+@pytest.mark.slow
 def test_a_full_disk_fails_only_the_runs_without_space(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
     words = ("sweep", "rpi_main", *TINY, "seed=0", "score=test")
     assert epo(*words, "experiment=rpi/const_vel") == 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import pytest
@@ -22,14 +23,14 @@ EXPERIMENTS = [row for row in ROWS if not row.startswith("urban/")]
 LIKE = {"rpi": "rpi", "ucy": "pedestrians", "dut": "pedestrians"}
 """Kind of scenes by folder of experiments; other folders have highway scenes."""
 WORDS = ("data=drawn", "data.scenes=16", "data.batch_size=4", "budget=smoke", "callbacks.progress=none")
+ALIKE = re.compile(r"_no_pair$|(vibes|hivt_m)_(refined|epo_)")
+"""Rows that differ from another row in `energy.pair: []`, or from one of V-LSTM in a backbone that a third row trains."""
 FEWER = {f"table1/{row}_dsdnet": ["solver.candidates=20"] for row in ("rpi", "highway")}
 """Changes of rows that would take 20 s: comparing 100 candidates of every two agents is slow."""
 
 
 @pytest.mark.parametrize(
-    "experiment",
-    # A row without pair term is another row with `energy.pair: []`.
-    [pytest.param(row, marks=pytest.mark.slow if row.endswith("_no_pair") else ()) for row in EXPERIMENTS],
+    "experiment", [pytest.param(row, marks=pytest.mark.slow if ALIKE.search(row) else ()) for row in EXPERIMENTS]
 )
 def test_every_experiment_trains_and_is_scored(experiment: str, tmp_path: Path) -> None:
     like = LIKE.get(experiment.partition("/")[0], "highway")

@@ -121,6 +121,7 @@ def test_a_failed_run_is_reported_and_does_not_stop_the_others(epo: Epo, capsys:
     assert all(job.run.record["status"] == "failed" for job in sweep.jobs if sweep.state(job) == "failed")
 
 
+@pytest.mark.slow
 def test_a_run_that_fails_again_is_reported_again(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
     words = (*SWEEP, "optimizer.lr=1e25")
     assert epo(*words) == 1
@@ -180,7 +181,7 @@ def test_one_damaged_run_does_not_hide_the_others(epo: Epo, capsys: pytest.Captu
     assert "is not JSON" in " ".join(out.split())
 
 
-@pytest.mark.parametrize("place", ["a,b", "x(1)", "it's", "über", "a=b", "[z]", "{k}", "#5", "~t", 'q"q', "s p", "a:b"])
+@pytest.mark.parametrize("place", ["a,b x(1)=it's", "[z]{k}über", "#5", "~t", 'q"q a:b'])
 def test_folders_may_have_any_name(epo: Epo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str) -> None:
     (tmp_path / place).mkdir()
     monkeypatch.chdir(tmp_path / place)

@@ -179,6 +179,7 @@ def test_kernels_that_differ_in_constants_are_not_taken_for_each_other():
     assert len(hashes) == len(made)
 
 
+@pytest.mark.slow
 def test_the_largest_games_in_double_precision_fit_into_the_memory_of_a_multiprocessor(tmp_path):
     """Their arrays are in global memory; for the sum of all functions' arrays, ptxas has 48 kB of shared memory."""
     for resources in ahead_of_time.compile_for(90, True, fused.SIZES[-1], fused.FEW, tmp_path).values():
