@@ -68,7 +68,7 @@ class Report:
         """Report on all runs in and below a folder.
 
         Raises:
-            ConfigError: as :func:`~epo_lightning.report.collect`.
+            ConfigError: as :func:`~epo_lightning.report.runs.collect`.
         """
         known = find_runs(folder)
         runs = [run for run in known if is_measured(run)]
@@ -122,7 +122,7 @@ def write_report(
         The text of results.md.
 
     Raises:
-        ConfigError: as :func:`~epo_lightning.report.build_tables`.
+        ConfigError: as :func:`~epo_lightning.report.tables.build_tables`.
     """
     from epo_lightning.report.charts import charts_of
     from epo_lightning.report.page import Content, page
