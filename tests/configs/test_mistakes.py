@@ -189,6 +189,12 @@ def test_a_check_without_the_data_says_in_one_line_what_is_missing(
             r"in the defaults list of /.*data/mine\.yaml, .*: unknown option data=rpj",
         ),
         (
+            "data/mine.yaml",
+            "defaults: [exid, _self_]\nformat: my_csv",
+            "experiment=highway/v_lstm data='mine'",
+            r"data/mine\.yaml sets `format` without `dataset`, .* such as `dataset: mine`",
+        ),
+        (
             "experiment/mine.yaml",
             "# @package _global_\ndefaults: [rpi/v_lstm, _self_]\ntitle: mine",
             "experiment=mine backbone=v_lstn",

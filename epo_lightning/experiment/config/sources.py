@@ -78,6 +78,8 @@ class TreeSource(ParsedOnce):
             found = super().load_config(config_path)
             if config_path.startswith(f"{EXPERIMENTS}/"):
                 _check_defaults(Path(self.path) / self._normalize_file_name(config_path), found.config)
+            if config_path.startswith("data/"):
+                _check_name(Path(self.path) / self._normalize_file_name(config_path), found.config)
             return found
         data, name = row
         return ConfigResult(
@@ -141,6 +143,19 @@ def _check_defaults(file: Path, config: Container) -> None:
         raise ConfigError(
             f"in the defaults list of {file}, `- _self_` stands before `- {rows[0]}`, whose settings would replace those of "
             "this file: put `- _self_` last"
+        )
+
+
+def _check_name(file: Path, config: Container) -> None:
+    """Refuse a file of recordings in a format of their own that gives them no name.
+
+    Raises:
+        ConfigError: they would have the name of the base file's recordings, in tables and in the cache.
+    """
+    if isinstance(config, DictConfig) and "format" in config and "dataset" not in config:
+        raise ConfigError(
+            f"{file} sets `format` without `dataset`, so that its recordings would be named after those of its base: add a "
+            f"name of their own, such as `dataset: {file.stem}`"
         )
 
 
