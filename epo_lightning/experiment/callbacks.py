@@ -166,7 +166,10 @@ def _require_logged(monitor: str | None, trainer: Trainer) -> None:
 
 
 class EpochLines(Callback):
-    """Callback that prints one line per validated epoch, for log files and for several runs in one terminal."""
+    """Callback that prints one line per validated epoch, for log files and for several runs in one terminal.
+
+    It comes before the losses of the epoch are logged. With several devices, it prints the loss of the first one.
+    """
 
     def __init__(self, title: str, monitor: str) -> None:
         self._title, self._monitor = title, monitor

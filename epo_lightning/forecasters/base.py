@@ -147,7 +147,8 @@ class Forecaster(LightningModule):
         self.step_means.reset()
 
     def on_train_epoch_end(self) -> None:
-        self.log_dict(self.step_means.means(), batch_size=self.step_means.scenes, sync_dist=True)
+        for name, (total, scenes) in self.step_means.totals().items():
+            self.log(name, total / scenes, batch_size=scenes, sync_dist=True)
 
     def backward(self, loss: Tensor, *args: Any, **kwargs: Any) -> None:
         """Backward pass; nothing is left to do if the gradients have come with the loss (``step_graph``)."""

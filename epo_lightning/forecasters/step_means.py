@@ -15,28 +15,38 @@ class StepMeans:
     """
 
     def __init__(self) -> None:
-        self.reset()
+        self._sums: dict[tuple[str, ...], tuple[Tensor, int]] = {}
 
     def reset(self) -> None:
         """Forget all steps."""
-        self._names: tuple[str, ...] = ()
-        self._sums: Tensor | None = None
-        self.scenes = 0
+        self._sums.clear()
 
     def add(self, values: Mapping[str, Tensor], scenes: int) -> None:
         """Add the values of one step.
 
         Args:
-            values: scalars by name, the same names in every step; they are not kept, so that they may change in place.
+            values: numbers by name, in tensors of one element; they are not kept, so that they may change in place.
             scenes: number of scenes of the step, over which each value is a mean.
         """
-        sums = torch.stack([value.detach() for value in values.values()]) * scenes
-        self._names = tuple(values)
-        self._sums = sums if self._sums is None else self._sums + sums
-        self.scenes += scenes
+        names = tuple(values)
+        sums = torch.stack([value.detach().reshape(()) for value in values.values()]) * scenes
+        if names in self._sums:
+            before, scenes_before = self._sums[names]
+            sums, scenes = before + sums, scenes_before + scenes
+        self._sums[names] = sums, scenes
+
+    def totals(self) -> dict[str, tuple[Tensor, int]]:
+        """The sum over the scenes of all steps since the last reset, and the number of scenes, of every name.
+
+        A name that some steps lack counts the scenes of the others.
+        """
+        totals: dict[str, tuple[Tensor, int]] = {}
+        for names, (sums, scenes) in self._sums.items():
+            for name, value in zip(names, sums, strict=True):
+                before, scenes_before = totals.get(name, (torch.zeros_like(value), 0))
+                totals[name] = before + value, scenes_before + scenes
+        return totals
 
     def means(self) -> dict[str, Tensor]:
         """The means of all steps since the last reset; empty if there was none."""
-        if self._sums is None:
-            return {}
-        return dict(zip(self._names, self._sums / self.scenes, strict=True))
+        return {name: total / scenes for name, (total, scenes) in self.totals().items()}

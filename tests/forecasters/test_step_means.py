@@ -30,7 +30,7 @@ class Both(lightning.LightningModule):
 
     def on_train_epoch_end(self) -> None:
         self.epochs.append(self.means.means())
-        self.log_dict(self.means.means(), batch_size=self.means.scenes)
+        self.log_dict(self.means.means())
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         return torch.optim.SGD(self.parameters(), lr=0.1)
@@ -59,4 +59,12 @@ def test_values_that_change_in_place_are_those_of_their_step() -> None:
     for number in (1.0, 3.0):
         means.add({"loss": value.fill_(number)}, 2)
     assert means.means()["loss"] == 2.0
-    assert means.scenes == 4
+
+
+def test_steps_may_have_other_losses_in_another_order_and_of_one_element() -> None:
+    means = StepMeans()
+    means.add({"loss": torch.tensor(1.0), "goal": torch.tensor([10.0])}, 1)
+    means.add({"goal": torch.tensor([20.0]), "loss": torch.tensor(2.0)}, 3)
+    means.add({"loss": torch.tensor(6.0)}, 4)
+    assert means.means() == {"loss": (1 + 6 + 24) / 8, "goal": (10 + 60) / 4}
+    assert {name: scenes for name, (_, scenes) in means.totals().items()} == {"loss": 8, "goal": 4}
