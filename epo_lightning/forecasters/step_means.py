@@ -11,7 +11,7 @@ from torch import Tensor
 class StepMeans:
     """Means of the losses over the scenes of an epoch, by name.
 
-    A step adds to one tensor. Lightning's ``self.log`` would take a twelfth of the time of a whole training step on a CPU.
+    A step adds to one tensor. Lightning's ``self.log`` would take about 7 % of a training step on a CPU.
     """
 
     def __init__(self) -> None:

@@ -32,7 +32,9 @@ def test_a_committed_results_file_is_whole_small_and_without_folders_of_a_machin
 def test_tables_and_figures_are_rebuilt_from_a_results_file_byte_for_byte(
     file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("epo_lightning.report.page.page", lambda _: "")  # half of the time, and not committed
+    monkeypatch.setattr(
+        "epo_lightning.report.page.page", lambda _: ""
+    )  # index.html takes half of the time, and is not committed
     committed = ROOT / "docs" / "tables" / file.stem
     report(ReportSettings(results=str(file), out=str(tmp_path)))
     shown = {path.relative_to(committed) for path in committed.rglob("*.*")}

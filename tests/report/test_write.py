@@ -14,7 +14,9 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
+from epo_lightning.metrics.functional.interaction import SUBSETS
 from epo_lightning.registry import ConfigError
+from epo_lightning.report.columns import INTERACTIVE
 from epo_lightning.report.write import Report, write_report
 from epo_lightning.run_folder import write_json
 
@@ -224,3 +226,7 @@ def test_equal_runs_give_equal_bytes(tmp_path: Path) -> None:
     assert len(files) == 6
     for path in files:
         assert (tmp_path / "one" / path).read_bytes() == (tmp_path / "two" / path).read_bytes()
+
+
+def test_the_subset_with_a_table_of_its_own_is_one_of_the_metrics() -> None:
+    assert INTERACTIVE in SUBSETS

@@ -143,8 +143,10 @@ def _refuse_ignored(values: Mapping[str, Any], overrides: Iterable[str]) -> None
     """
     settings = re.compile(rf"[+~]*((?!solver\.backend=)({'|'.join(OF_GAMES)})(?:[.=].*)?)")
     given = [match for word in overrides if (match := settings.fullmatch(word))]
-    # Forecasters are imported with Lightning, which takes seconds: only where there is something to check.
-    chosen = parts("forecaster").get(name := str(_name(values, "forecaster"))) if given else None
+    if not given:  # nothing to check, so that Lightning, which takes seconds, is not imported
+        return
+    name = str(_name(values, "forecaster"))
+    chosen = parts("forecaster").get(name)
     if chosen is None:
         return
     own, section = inspect.signature(chosen).parameters, values["forecaster"]

@@ -76,10 +76,11 @@ class TreeSource(ParsedOnce):
         row = self._row_on_highways(config_path)
         if row is None:
             found = super().load_config(config_path)
+            file = Path(self.path) / self._normalize_file_name(config_path)
             if config_path.startswith(f"{EXPERIMENTS}/"):
-                _check_defaults(Path(self.path) / self._normalize_file_name(config_path), found.config)
+                _check_defaults(file, found.config)
             if config_path.startswith("data/"):
-                _check_name(Path(self.path) / self._normalize_file_name(config_path), found.config)
+                _check_name(file, found.config)
             return found
         data, name = row
         return ConfigResult(
