@@ -20,6 +20,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from epo_lightning.data.recorded.lanes import LaneGraph
+    from epo_lightning.data.recorded.road_scenes import RoadScenes
     from epo_lightning.forecast import GameParameters, JointForecast, Solution, Status
     from epo_lightning.forecasters import load
     from epo_lightning.game.dynamics import Unicycle
@@ -40,7 +42,9 @@ _HOMES = {
     "Scene": "scene",
     "Solution": "forecast",
     "Status": "forecast",
+    "LaneGraph": "data.recorded.lanes",
     "LevenbergMarquardt": "solvers.gauss_newton.levenberg_marquardt",
+    "RoadScenes": "data.recorded.road_scenes",
     "read_predictions": "predictions",
     "refine": "refinement",
     "write_predictions": "predictions",
@@ -51,7 +55,9 @@ __all__ = [
     "FeatureEnergy",
     "GameParameters",
     "JointForecast",
+    "LaneGraph",
     "LevenbergMarquardt",
+    "RoadScenes",
     "Scene",
     "Solution",
     "Status",

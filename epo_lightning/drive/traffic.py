@@ -17,9 +17,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from epo_lightning.data.recorded.lanes import LaneGraph
+from epo_lightning.data.recorded.road_scenes import RoadScenes
 from epo_lightning.drive.ride import WINDOWS, Ride, Simulation, contacts
 from epo_lightning.drive.road_game import ENERGY, road_game
-from epo_lightning.drive.road_scenes import RoadScenes
 from epo_lightning.drive.world import EGO, Outcome, Search
 from epo_lightning.forecast import GameParameters
 from epo_lightning.game.dynamics import Unicycle
@@ -117,7 +117,7 @@ class TrafficWorld:
         for ride, rows, there in zip(rides, near, np.split(on, ends), strict=True):
             ride.choose(rows[there])
         history, seen, there, size, kind = map(np.stack, zip(*(ride.history() for ride in rides), strict=True))
-        return make(history, seen, there, size, kind, framed=WINDOWS.agents)
+        return make(history, size, seen, there, kind, framed=WINDOWS.agents, on_lanes_only=False)
 
     def _maker(self, lanes: LaneGraph) -> RoadScenes:
         if id(lanes) not in self._scenes:

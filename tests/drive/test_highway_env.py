@@ -9,13 +9,13 @@ import pytest
 import torch
 
 import epo_lightning
+from epo_lightning.data.recorded.road_scenes import RoadScenes
 from epo_lightning.drive import highway_env
 from epo_lightning.drive.episodes import play
 from epo_lightning.drive.highway_env import HighwayEnvSimulator, highway_env_world
 from epo_lightning.drive.measures import measure
 from epo_lightning.drive.planners import ForecastPlanner, ResponsePlanner, first_agents
 from epo_lightning.drive.ride import SEEN, WINDOWS
-from epo_lightning.drive.road_scenes import RoadScenes
 from epo_lightning.drive.traffic import TrafficWorld
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import FIELDS
@@ -53,7 +53,7 @@ def test_forecasters_are_shown_the_nearest_vehicles_alone(world: TrafficWorld) -
     near = first_agents(scene, world.agents)
     assert near.agent_mask.shape == (1, WINDOWS.agents)
     history, seen, there, size, kind = (values[None, : WINDOWS.agents] for values in ride.history())
-    alone = RoadScenes(ride.simulation.lanes, WINDOWS)(history, seen, there, size, kind)
+    alone = RoadScenes(ride.simulation.lanes, WINDOWS)(history, size, seen, there, kind)
     for name in FIELDS:
         torch.testing.assert_close(getattr(near, name), getattr(alone, name))
     distance = ride.now.distance[[ride.now.rows[name] for name in ride._members if name]]

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
+from epo_lightning.data.recorded.road_scenes import RoadScenes
 from epo_lightning.data.recorded.scenes import RecordedScenes
 from epo_lightning.data.recorded.windows import WindowConfig, extract
 from epo_lightning.drive.planners import GamePlanner, Plan, ResponsePlanner
 from epo_lightning.drive.road_game import ENERGY, keep_going, road_game
-from epo_lightning.drive.road_scenes import RoadScenes
 from epo_lightning.drive.traffic import TrafficWorld
 from epo_lightning.drive.world import Search
 from epo_lightning.game.dynamics import Unicycle
@@ -45,9 +45,9 @@ def test_scenes_are_those_of_recorded_data(recorded: tuple[RecordedScenes, RoadS
         history[..., :2] += origin
         made = make(
             history[None],
+            scenes.tables["size"][rows].numpy()[None],
             wanted.history_mask.numpy(),
             wanted.agent_mask.numpy(),
-            scenes.tables["size"][rows].numpy()[None],
             scenes.tables["kind"][rows].numpy()[None],
         )
         for name in ("history", "size", "lanes", "goal_candidates", "references", "reference_speed", "frame"):
@@ -112,7 +112,10 @@ def test_vehicles_in_all_directions_have_the_frame_of_the_first(
     given = {name: np.concatenate([values[:, :1]] * 2, 1) for name, values in vehicles(scenes, origin).items()}
     given["history"][0, 1, :, 2] += np.pi
     heading = torch.tensor(given["history"][0, 0, -1, 2])
-    torch.testing.assert_close(make(**given).frame[0, 2].double(), heading, atol=1e-5, rtol=0)
+    with pytest.raises(ValueError, match="agent 1 of scene 0 is on no lane"):
+        make(**given)
+    made = make(**given, on_lanes_only=False)
+    torch.testing.assert_close(made.frame[0, 2].double(), heading, atol=1e-5, rtol=0)
 
 
 def test_lanes_without_a_limit_have_that_of_the_windows(

@@ -147,6 +147,68 @@ class LaneGraph:
     def __len__(self) -> int:
         return len(self.ids)
 
+    @classmethod
+    def from_centrelines(
+        cls,
+        centre: Sequence[Polyline],
+        width: float,
+        successors: Sequence[Sequence[int]] | None = None,
+        left_of: Sequence[int] | None = None,
+        speed_limit: float = np.nan,
+    ) -> LaneGraph:
+        """Lanes of one width around centrelines, for a map of one's own.
+
+        Args:
+            centre: points of each lane in driving direction [m].
+            width: width of the lanes [m].
+            successors: lanes that begin where a lane ends; None if lanes lead nowhere.
+            left_of: index of the left neighbour of each lane, to which vehicles may change, and -1 for none; None if no
+                lane has a neighbour.
+            speed_limit: [m/s]; NaN if it is unknown.
+
+        Raises:
+            RecordingError: lines without length, or lanes that do not exist.
+
+        Example:
+            >>> LaneGraph.from_centrelines([np.array([[0.0, 0.0], [50.0, 0.0]])], width=4.0).left[0].tolist()
+            [[0.0, 2.0], [50.0, 2.0]]
+        """
+        lines = []
+        for lane, line in enumerate(centre):
+            points = np.asarray(line, dtype=float)
+            if points.ndim != 2 or points.shape[1] != 2 or len(points) < 2 or not np.ptp(points, axis=0).any():
+                raise RecordingError(
+                    "the map",
+                    f"the centreline of lane {lane} has shape {list(points.shape)}, expected [n, 2] with length",
+                )
+            lines.append(without_repetitions(points))
+        count = len(lines)
+        following = [()] * count if successors is None else [tuple(after) for after in successors]
+        left = np.full(count, -1) if left_of is None else np.asarray(left_of, dtype=int)
+        for name, given in (("successors", following), ("left_of", left)):
+            if len(given) != count:
+                raise RecordingError(
+                    "the map", f"{name} has {len(given)} entries, expected one for each of {count} lanes"
+                )
+        if (left >= count).any():
+            raise RecordingError("the map", f"left_of names lane {left.max()}, but the last lane is {count - 1}")
+        right = np.full(count, -1)
+        right[left[left >= 0]] = np.flatnonzero(left >= 0)
+        aside = [width / 2 * _to_the_left(line) for line in lines]
+        return cls(
+            ids=np.arange(count),
+            left=[line + way for line, way in zip(lines, aside, strict=True)],
+            right=[line - way for line, way in zip(lines, aside, strict=True)],
+            centre=lines,
+            successors=following,
+            left_of=left,
+            right_of=right,
+            adjacent_left=left,
+            adjacent_right=right,
+            speed_limit=np.full(count, speed_limit),
+            kind=np.full(count, LANE),
+        ).check("the map")
+
     def check(self, path: Path | str) -> LaneGraph:
         """This graph, after a check of its geometry and references.
 
@@ -275,6 +337,12 @@ class LaneGraph:
         around = _reached(lane, self.successors) | _reached(lane, self.predecessors)
         near = _reached(other, self.successors) | _reached(other, self.predecessors)
         return any(int(beside[each]) in near for each in around for beside in (self.adjacent_left, self.adjacent_right))
+
+
+def _to_the_left(line: Polyline) -> Polyline:
+    """Unit vectors to the left of a line, at its points."""
+    way = np.gradient(line, axis=0)
+    return np.stack([-way[:, 1], way[:, 0]], 1) / np.linalg.norm(way, axis=1, keepdims=True)
 
 
 def _reached(lane: int, following: Sequence[tuple[int, ...]]) -> set[int]:

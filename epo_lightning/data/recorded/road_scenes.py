@@ -1,4 +1,4 @@
-"""Scenes of vehicles on a map, in the format of recorded data: forecasters that learned on recordings can read them."""
+"""Scenes of vehicles on a map of one's own, as recordings would give them, so that trained forecasters can read them."""
 
 from __future__ import annotations
 
@@ -22,13 +22,17 @@ class RoadScenes:
     """Scenes as :func:`~epo_lightning.data.recorded.windows.extract` and
     :class:`~epo_lightning.data.recorded.scenes.RecordedScenes` make them, without a future.
 
+    A call returns lanes, reference lines and goal candidates (Appendix E.1) of the given vehicles, in the axes that
+    forecasters of highways read: x along the mean heading of the vehicles, and the origin at their mean position.
+    ``scene.frame`` leads back to the map (:func:`~epo_lightning.frames.in_world`).
+
     Args:
         lanes: the map.
-        windows: settings of the windows, those of the forecasters' data.
+        windows: settings of the windows, those of the forecasters' data; by default those of exiD and of simulated highways.
     """
 
-    def __init__(self, lanes: LaneGraph, windows: WindowConfig) -> None:
-        self.lanes, self.windows = lanes, windows
+    def __init__(self, lanes: LaneGraph, windows: WindowConfig | None = None) -> None:
+        self.lanes, self.windows = lanes, windows or WindowConfig()
         self._routes = Routes(lanes)
         self._pieces = pieces(lanes, VECTORS, SPACING)
 
@@ -39,26 +43,46 @@ class RoadScenes:
     def __call__(
         self,
         history: Float[np.ndarray, "B N H 4"],
-        history_mask: Bool[np.ndarray, "B N H"],
-        agent_mask: Bool[np.ndarray, "B N"],
         size: Float[np.ndarray, "B N 2"],
-        kind: Int[np.ndarray, "B N"],
+        history_mask: Bool[np.ndarray, "B N H"] | None = None,
+        agent_mask: Bool[np.ndarray, "B N"] | None = None,
+        kind: Int[np.ndarray, "B N"] | None = None,
         framed: int | None = None,
+        on_lanes_only: bool = True,
     ) -> Scene:
-        """The scenes of some vehicles, of which those that are there are on lanes.
+        """The scenes of some vehicles.
 
         Args:
-            history: states x, y [m], heading [rad], speed [m/s]; the last step is the current one.
-            history_mask: steps at which a vehicle was observed.
-            agent_mask: vehicles that are there; the first one of every scene is.
+            history: states x, y [m], heading [rad], speed [m/s] in the coordinates of the map, ``windows.dt`` apart; the
+                last step is the current one.
             size: length and width [m].
-            kind: classes of the vehicles, indices into :data:`~epo_lightning.scene.KINDS`.
+            history_mask: steps at which a vehicle was observed; None for all.
+            agent_mask: vehicles that are there; the first one of every scene is. None for all.
+            kind: classes of the vehicles, indices into :data:`~epo_lightning.scene.KINDS`; None for cars.
             framed: number of vehicles, the first ones, that decide on a scene's frame and lanes; None for all.
+            on_lanes_only: whether a vehicle on no lane, or against its direction, is an error. If not, its lines and goals
+                are those of the last lane, and mean nothing; a closed loop goes on with them.
+
+        Raises:
+            ValueError: arrays whose shapes do not fit, or a vehicle that is on no lane.
         """
+        history, size = np.asarray(history, dtype=float), np.asarray(size, dtype=float)
+        if history.ndim != 4 or history.shape[3] != 4:
+            raise ValueError(f"history has shape {list(history.shape)}, expected [B, N, H, 4]: x, y, heading and speed")
+        if size.shape != (*history.shape[:2], 2):
+            raise ValueError(f"size has shape {list(size.shape)}, expected {[*history.shape[:2], 2]}: length and width")
+        history_mask = np.ones(history.shape[:3], dtype=bool) if history_mask is None else history_mask
+        agent_mask = np.ones(history.shape[:2], dtype=bool) if agent_mask is None else agent_mask
+        kind = np.zeros(history.shape[:2], dtype=int) if kind is None else kind
         first = np.arange(agent_mask.shape[1]) < (framed or agent_mask.shape[1])
-        scene, _ = there = np.nonzero(agent_mask)
+        scene, agent = there = np.nonzero(agent_mask)
         now = history[there][:, -1]
         here = self.lanes.locate(now[:, :2], now[:, HEADING])
+        for row in np.flatnonzero((here.lane < 0) & on_lanes_only)[:1]:
+            raise ValueError(
+                f"agent {agent[row]} of scene {scene[row]} is on no lane, at ({now[row, 0]:.1f}, {now[row, 1]:.1f}) m: "
+                "leave it out with agent_mask (`on_lanes` says which states are on lanes), or correct the map or its heading"
+            )
         route = self._routes.of(now[:, :2], now[:, SPEED], here, self.windows.horizon * self.windows.dt)
         limit = self.lanes.speed_limit[here.lane]
         counted = (agent_mask & first)[..., None]
