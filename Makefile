@@ -62,7 +62,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # $(1): the extras. The layer is compiled on one core while packages are downloaded and unpacked on another.
 # Without a compiler its build fails, and the last line says so.
 define INSTALL
-@echo "installing into $(VENV): a minute or two and the download, while the layer is compiled in the background ..."
+@echo "installing into $(VENV): one to five minutes and the download, while the layer is compiled in the background ..."
 $(PYTHON) -m venv $(VENV)
 $(BIN)/pip install -q --no-compile uv || true
 $(if $(TORCH_INDEX),$(call INSTALL_PACKAGES,--index-url $(TORCH_INDEX) -c constraints.txt torch))

@@ -154,7 +154,8 @@ def _missing_option(instance: Hydra, missing: str, message: str) -> str:
     if option in parts(group):
         return (
             f"unknown option {group}={option}: there is a part of this name, but no file conf/{group}/{option}.yaml, which "
-            f"begins with the line `name: {option}`. {_known(option, options)}"
+            f"begins with the line `name: {option}`; a folder of your own is searched with --config-dir <folder>. "
+            f"{_known(option, options)}"
         )
     if (file := Path("conf") / group / f"{option}.yaml").is_file():
         return f"unknown option {group}={option}: {file} is found with the option --config-dir conf"

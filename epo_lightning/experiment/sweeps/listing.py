@@ -31,7 +31,7 @@ def unknown(name: str, names: Collection[str]) -> str:
     for home in (Path(name).parent.parent, Path("conf")):
         if option not in names and (file := home / GROUP / f"{option}.yaml").is_file():
             return f"unknown sweep {name!r}: {file} is found by `{command_line(['epo', 'sweep', option], [str(home)])}`"
-    return f"unknown sweep {name!r}: {nearest(option, names)}"
+    return f"unknown sweep {name!r}: {nearest(option, names)}; those of a folder of your own need --config-dir <folder>"
 
 
 def _description(comments: Sequence[str]) -> str:
