@@ -98,10 +98,11 @@ def test_fair_twins_differ_in_the_goal_only(row: str) -> None:
 
 
 @pytest.mark.parametrize("budget", names(CONF / "budget"))
-@pytest.mark.parametrize("debug", [[], *([f"debug='{name}'"] for name in names(CONF / "debug"))])
-def test_budgets_and_debugging_compose(budget: str, debug: list[str]) -> None:
-    settings = read(Settings, compose("train", ["experiment=rpi/v_lstm_epo", f"budget={budget}", *debug]))
-    assert settings.budget.name == budget
+@pytest.mark.parametrize("debug", [None, *names(CONF / "debug")])
+def test_budgets_and_debugging_compose(budget: str, debug: str | None) -> None:
+    words = ["experiment=rpi/v_lstm_epo", f"budget={budget}", *([f"debug='{debug}'"] if debug else [])]
+    settings = read(Settings, compose("train", words))
+    assert settings.budget.name == (f"debug_{debug}" if debug else budget)
 
 
 @pytest.mark.parametrize("data", names(CONF / "data"))
