@@ -161,13 +161,14 @@ class LaneGraph:
         Args:
             centre: points of each lane in driving direction [m].
             width: width of the lanes [m].
-            successors: lanes that begin where a lane ends; None if lanes lead nowhere.
+            successors: lanes that begin where a lane ends; None if lanes lead nowhere. A ring consists of several lanes.
             left_of: index of the left neighbour of each lane, to which vehicles may change, and -1 for none; None if no
-                lane has a neighbour.
+                lane has a neighbour. Neighbours should begin and end beside each other: cut the lanes where one joins.
             speed_limit: [m/s]; NaN if it is unknown.
 
         Raises:
-            RecordingError: lines without length, or lanes that do not exist.
+            RecordingError: lines without length, lanes that do not exist, a left neighbour that is not to the left, or a
+                width or speed limit that is not positive.
 
         Example:
             >>> LaneGraph.from_centrelines([np.array([[0.0, 0.0], [50.0, 0.0]])], width=4.0).left[0].tolist()
@@ -190,10 +191,10 @@ class LaneGraph:
                 raise RecordingError(
                     "the map", f"{name} has {len(given)} entries, expected one for each of {count} lanes"
                 )
-        if (left >= count).any():
-            raise RecordingError("the map", f"left_of names lane {left.max()}, but the last lane is {count - 1}")
-        right = np.full(count, -1)
-        right[left[left >= 0]] = np.flatnonzero(left >= 0)
+        for name, value in (("width", width), ("speed_limit", 1.0 if np.isnan(speed_limit) else speed_limit)):
+            if not 0 < value < np.inf:
+                raise RecordingError("the map", f"{name} is {value}, expected a positive number")
+        right = _right_of(lines, left)
         aside = [width / 2 * _to_the_left(line) for line in lines]
         return cls(
             ids=np.arange(count),
@@ -339,10 +340,37 @@ class LaneGraph:
         return any(int(beside[each]) in near for each in around for beside in (self.adjacent_left, self.adjacent_right))
 
 
+def _right_of(lines: Sequence[Polyline], left_of: Int[np.ndarray, " W"]) -> Int[np.ndarray, " W"]:
+    """The right neighbour of each lane, of which it is the left one.
+
+    Raises:
+        RecordingError: a left neighbour that does not exist, is not to the left, or is that of two lanes.
+    """
+    right = np.full(len(lines), -1)
+    for lane, other in enumerate(left_of.tolist()):
+        if other < 0:
+            continue
+        if other >= len(lines):
+            raise RecordingError("the map", f"left_of names lane {other}, but the last lane is {len(lines) - 1}")
+        if right[other] >= 0:
+            raise RecordingError(
+                "the map",
+                f"lanes {right[other]} and {lane} have the same left neighbour: cut it where one ends and the other begins",
+            )
+        middle = lines[lane][[len(lines[lane]) // 2]]
+        _, offset = Polylines([lines[other]]).project(np.array([0]), middle)
+        if offset[0] >= 0:
+            raise RecordingError("the map", f"left_of of lane {lane} is {other}, which is not to its left")
+        right[other] = lane
+    return right
+
+
 def _to_the_left(line: Polyline) -> Polyline:
-    """Unit vectors to the left of a line, at its points."""
-    way = np.gradient(line, axis=0)
-    return np.stack([-way[:, 1], way[:, 0]], 1) / np.linalg.norm(way, axis=1, keepdims=True)
+    """Vectors from the points of a line to those of the parallel line one metre to its left; sharp corners are cut."""
+    way = np.diff(line, axis=0)
+    normal = np.stack([-way[:, 1], way[:, 0]], 1) / np.linalg.norm(way, axis=1, keepdims=True)
+    before, after = np.concatenate([normal[:1], normal]), np.concatenate([normal, normal[-1:]])
+    return (before + after) / np.maximum(1.0 + (before * after).sum(1, keepdims=True), 0.5)
 
 
 def _reached(lane: int, following: Sequence[tuple[int, ...]]) -> set[int]:

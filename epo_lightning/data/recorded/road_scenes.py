@@ -29,15 +29,24 @@ class RoadScenes:
     Args:
         lanes: the map.
         windows: settings of the windows, those of the forecasters' data; by default those of exiD and of simulated highways.
+            With ``lanes=None``, a scene has all lanes of the map.
+
+    Raises:
+        ValueError: windows with a number of reference lines (``lines``), as forecasters of junctions have it.
     """
 
     def __init__(self, lanes: LaneGraph, windows: WindowConfig | None = None) -> None:
         self.lanes, self.windows = lanes, windows or WindowConfig()
+        if self.windows.lines is not None:
+            raise ValueError(
+                f"windows.lines is {self.windows.lines}: lines through junctions are made of recordings only"
+            )
         self._routes = Routes(lanes)
         self._pieces = pieces(lanes, VECTORS, SPACING)
 
     def on_lanes(self, states: Float[np.ndarray, "n 4"]) -> Bool[np.ndarray, " n"]:
         """Mask of the vehicles that are on a lane of the map; only these can be in a scene."""
+        states = np.asarray(states, dtype=float)
         return self.lanes.locate(states[:, :2], states[:, HEADING]).lane >= 0
 
     def __call__(
@@ -57,25 +66,38 @@ class RoadScenes:
                 last step is the current one.
             size: length and width [m].
             history_mask: steps at which a vehicle was observed; None for all.
-            agent_mask: vehicles that are there; the first one of every scene is. None for all.
+            agent_mask: vehicles that are there; the first one of every scene must be. None for all.
             kind: classes of the vehicles, indices into :data:`~epo_lightning.scene.KINDS`; None for cars.
             framed: number of vehicles, the first ones, that decide on a scene's frame and lanes; None for all.
             on_lanes_only: whether a vehicle on no lane, or against its direction, is an error. If not, its lines and goals
                 are those of the last lane, and mean nothing; a closed loop goes on with them.
 
         Raises:
-            ValueError: arrays whose shapes do not fit, or a vehicle that is on no lane.
+            ValueError: arrays whose shapes do not fit, a first vehicle that is not there, observed states that are not
+                finite, or a vehicle that is on no lane.
         """
         history, size = np.asarray(history, dtype=float), np.asarray(size, dtype=float)
         if history.ndim != 4 or history.shape[3] != 4:
             raise ValueError(f"history has shape {list(history.shape)}, expected [B, N, H, 4]: x, y, heading and speed")
-        if size.shape != (*history.shape[:2], 2):
-            raise ValueError(f"size has shape {list(size.shape)}, expected {[*history.shape[:2], 2]}: length and width")
-        history_mask = np.ones(history.shape[:3], dtype=bool) if history_mask is None else history_mask
-        agent_mask = np.ones(history.shape[:2], dtype=bool) if agent_mask is None else agent_mask
-        kind = np.zeros(history.shape[:2], dtype=int) if kind is None else kind
-        first = np.arange(agent_mask.shape[1]) < (framed or agent_mask.shape[1])
+        vehicles = history.shape[:2]
+        history_mask = np.ones(history.shape[:3], bool) if history_mask is None else np.asarray(history_mask, bool)
+        agent_mask = np.ones(vehicles, bool) if agent_mask is None else np.asarray(agent_mask, bool)
+        kind = np.zeros(vehicles, int) if kind is None else np.asarray(kind, int)
+        for name, values, shape in (
+            ("size", size, (*vehicles, 2)),
+            ("history_mask", history_mask, history.shape[:3]),
+            ("agent_mask", agent_mask, vehicles),
+            ("kind", kind, vehicles),
+        ):
+            if values.shape != shape:
+                raise ValueError(f"{name} has shape {list(values.shape)}, expected {list(shape)} as history")
+        framed = vehicles[1] if framed is None else framed
+        if framed < 1 or not (vehicles[1] and agent_mask[:, 0].all()):
+            raise ValueError("the first vehicle of every scene must be there (agent_mask[:, 0]), and framed at least 1")
+        first = np.arange(vehicles[1]) < framed
         scene, agent = there = np.nonzero(agent_mask)
+        for row in np.flatnonzero((history_mask[there] & ~np.isfinite(history[there]).all(-1)).any(-1))[:1]:
+            raise ValueError(f"agent {agent[row]} of scene {scene[row]} has observed states that are not finite")
         now = history[there][:, -1]
         here = self.lanes.locate(now[:, :2], now[:, HEADING])
         for row in np.flatnonzero((here.lane < 0) & on_lanes_only)[:1]:
