@@ -73,21 +73,25 @@ def test_goals_and_lines_of_vehicles_lie_on_the_lanes_that_they_can_reach() -> N
     scene = make(vehicles((0.0, 0.3, 20.0), (10.0, WIDTH, 25.0)), np.full((1, 2, 2), [4.5, 1.9]))
     assert scene.references is not None
     assert scene.goal_candidates is not None
-    points = in_world(torch.cat((scene.references, torch.zeros_like(scene.references)), -1), scene.frame)[0, ..., 1]
-    for agent, expected in ((0, (WIDTH, 0.0, -WIDTH / 2)), (1, (1.5 * WIDTH, WIDTH, 0.0))):
-        for line, y in enumerate(expected):  # left, own, right; beside the road its border
-            torch.testing.assert_close(points[agent, line], torch.full_like(points[agent, line], y), atol=1e-3, rtol=0)
+    goals = scene.goal_candidates.unflatten(2, (3, 20))
+    for points in (scene.references, goals):
+        across = in_world(torch.cat((points, torch.zeros_like(points)), -1), scene.frame)[0, ..., 1]
+        for agent, expected in ((0, (WIDTH, 0.0, -WIDTH / 2)), (1, (1.5 * WIDTH, WIDTH, 0.0))):
+            for line, y in enumerate(expected):  # left, own, right; beside the road its border
+                wanted = torch.full_like(across[agent, line], y)
+                torch.testing.assert_close(across[agent, line], wanted, atol=1e-3, rtol=0)
     back = in_world(scene.history[:, :, -1], scene.frame)[0]
     torch.testing.assert_close(back[:, :2], torch.tensor([[0.0, 0.3], [10.0, WIDTH]]).double(), atol=1e-4, rtol=0)
 
 
-def test_what_is_left_out_is_there_and_seen() -> None:
+def test_without_masks_all_vehicles_are_there_and_observed_and_cars() -> None:
     make = RoadScenes(LaneGraph.from_centrelines(LINES, WIDTH))
     history, size = vehicles((0.0, 0.0, 20.0), (10.0, WIDTH, 25.0)), np.full((1, 2, 2), [4.5, 1.9])
     everything = np.ones((1, 2, 10), dtype=bool)
     given = make(history, size, everything, everything[..., 0], np.zeros((1, 2), dtype=int))
     assert torch.equal(make(history, size).history, given.history)
-    assert torch.equal(make(history, size).agent_mask, given.agent_mask)
+    for name in ("history_mask", "agent_mask", "kind"):
+        assert torch.equal(getattr(make(history, size), name), getattr(given, name)), name
 
 
 def test_vehicles_beside_the_road_and_wrong_shapes_are_named() -> None:
