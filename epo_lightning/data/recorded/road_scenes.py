@@ -76,34 +76,19 @@ class RoadScenes:
             ValueError: arrays whose shapes do not fit, a first vehicle that is not there, observed states that are not
                 finite, or a vehicle that is on no lane.
         """
-        history, size = np.asarray(history, dtype=float), np.asarray(size, dtype=float)
-        if history.ndim != 4 or history.shape[3] != 4:
-            raise ValueError(f"history has shape {list(history.shape)}, expected [B, N, H, 4]: x, y, heading and speed")
-        vehicles = history.shape[:2]
-        history_mask = np.ones(history.shape[:3], bool) if history_mask is None else np.asarray(history_mask, bool)
-        agent_mask = np.ones(vehicles, bool) if agent_mask is None else np.asarray(agent_mask, bool)
-        kind = np.zeros(vehicles, int) if kind is None else np.asarray(kind, int)
-        for name, values, shape in (
-            ("size", size, (*vehicles, 2)),
-            ("history_mask", history_mask, history.shape[:3]),
-            ("agent_mask", agent_mask, vehicles),
-            ("kind", kind, vehicles),
-        ):
-            if values.shape != shape:
-                raise ValueError(f"{name} has shape {list(values.shape)}, expected {list(shape)} as history")
-        framed = vehicles[1] if framed is None else framed
-        if framed < 1 or not (vehicles[1] and agent_mask[:, 0].all()):
+        history, size, history_mask, agent_mask, kind = _checked(history, size, history_mask, agent_mask, kind)
+        first = np.arange(agent_mask.shape[1]) < (agent_mask.shape[1] if framed is None else framed)
+        if not (agent_mask & first)[:, :1].all() or not agent_mask.shape[1]:
             raise ValueError("the first vehicle of every scene must be there (agent_mask[:, 0]), and framed at least 1")
-        first = np.arange(vehicles[1]) < framed
         scene, agent = there = np.nonzero(agent_mask)
-        for row in np.flatnonzero((history_mask[there] & ~np.isfinite(history[there]).all(-1)).any(-1))[:1]:
-            raise ValueError(f"agent {agent[row]} of scene {scene[row]} has observed states that are not finite")
         now = history[there][:, -1]
         here = self.lanes.locate(now[:, :2], now[:, HEADING])
-        for row in np.flatnonzero((here.lane < 0) & on_lanes_only)[:1]:
+        lost = np.flatnonzero(here.lane < 0)
+        if on_lanes_only and len(lost):
+            x, y = now[lost[0], :2]
             raise ValueError(
-                f"agent {agent[row]} of scene {scene[row]} is on no lane, at ({now[row, 0]:.1f}, {now[row, 1]:.1f}) m: "
-                "leave it out with agent_mask (`on_lanes` says which states are on lanes), or correct the map or its heading"
+                f"agent {agent[lost[0]]} of scene {scene[lost[0]]} is on no lane, at ({x:.1f}, {y:.1f}) m: leave it out "
+                "with agent_mask (`on_lanes` says which states are on lanes), or correct the map or its heading"
             )
         route = self._routes.of(now[:, :2], now[:, SPEED], here, self.windows.horizon * self.windows.dt)
         limit = self.lanes.speed_limit[here.lane]
@@ -148,3 +133,40 @@ class RoadScenes:
         columns = {name: torch.as_tensor(values) for name, values in tables.columns().items()}
         scenes = RecordedScenes(columns, self.windows.dt, "aligned", ("",))[torch.arange(len(origin))]
         return dataclasses.replace(scenes, future=None, future_mask=None, id=None)
+
+
+def _checked(
+    history: np.ndarray,
+    size: np.ndarray,
+    history_mask: np.ndarray | None,
+    agent_mask: np.ndarray | None,
+    kind: np.ndarray | None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The vehicles of scenes as arrays, with the values of those that are None.
+
+    Raises:
+        ValueError: shapes that do not fit, or observed states of present vehicles that are not finite.
+    """
+    history, size = np.asarray(history, dtype=float), np.asarray(size, dtype=float)
+    if history.ndim != 4 or history.shape[3] != 4:
+        raise ValueError(f"history has shape {list(history.shape)}, expected [B, N, H, 4]: x, y, heading and speed")
+    steps, vehicles = history.shape[:3], history.shape[:2]
+    history_mask = np.ones(steps, bool) if history_mask is None else np.asarray(history_mask, bool)
+    agent_mask = np.ones(vehicles, bool) if agent_mask is None else np.asarray(agent_mask, bool)
+    kind = np.zeros(vehicles, int) if kind is None else np.asarray(kind, int)
+    for name, values, shape in (
+        ("size", size, (*vehicles, 2)),
+        ("history_mask", history_mask, steps),
+        ("agent_mask", agent_mask, vehicles),
+        ("kind", kind, vehicles),
+    ):
+        if values.shape != shape:
+            raise ValueError(f"{name} has shape {list(values.shape)}, expected {list(shape)}, as history")
+    observed = history_mask & agent_mask[..., None]
+    bad = np.argwhere(observed & ~np.isfinite(history).all(-1))
+    if len(bad):
+        scene, agent, step = bad[0]
+        raise ValueError(
+            f"agent {agent} of scene {scene} was observed at step {step} of history, but is not finite there"
+        )
+    return history, size, history_mask, agent_mask, kind

@@ -113,7 +113,9 @@ def test_vehicles_beside_the_road_and_wrong_shapes_are_named() -> None:
         with pytest.raises(ValueError, match="the first vehicle of every scene must be there"):
             make(history, size, **words)
     history[0, 1, 3] = np.nan
-    with pytest.raises(ValueError, match="agent 1 of scene 0 has observed states that are not finite"):
+    with pytest.raises(
+        ValueError, match="agent 1 of scene 0 was observed at step 3 of history, but is not finite there"
+    ):
         make(history, size)
     with pytest.raises(ValueError, match=r"windows\.lines is 6"):
         RoadScenes(make.lanes, WindowConfig(lines=6))
