@@ -99,6 +99,7 @@ def test_vehicles_beside_the_road_and_wrong_shapes_are_named() -> None:
     history, size = vehicles((0.0, 0.0, 20.0), (10.0, 40.0, 25.0)), np.full((1, 2, 2), [4.5, 1.9])
     with pytest.raises(ValueError, match=r"agent 1 of scene 0 is on no lane, at \(10.0, 40.0\) m: leave it out"):
         make(history, size)
+    assert make.on_lanes(history[0, :, -1]).tolist() == [True, False]
     make(history, size, agent_mask=np.array([[True, False]]))
     with pytest.raises(ValueError, match=r"history has shape \[2, 10, 4\], expected \[B, N, H, 4\]"):
         make(history[0], size)
