@@ -171,6 +171,8 @@ def test_the_jobs_of_a_sweep_train_one_after_the_other(epo: Epo) -> None:
 
 @pytest.mark.slow
 def test_the_jobs_of_a_sweep_train_in_workers(epo: Epo) -> None:
+    # Workers that an earlier test has left waiting would still have the environment of that test.
+    pytest.importorskip("joblib.externals.loky").get_reusable_executor().shutdown()
     sweep(epo, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
 
 
