@@ -121,6 +121,13 @@ def test_absent_agents_on_the_line_are_not_avoided():
     assert_close(found[::2], alone[:, 1], rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("angle", [0.8, -0.8, 2.5, -2.5])
+def test_cars_that_cross_the_line_of_another_one_do_not_swerve(angle):
+    """Their energies have derivatives to the side."""
+    rows = torch.tensor([[0.0, 0.0, 0.0, 8.0], [20.0, 0.0, angle, 8.0]]).double()
+    assert not swerve(Scene(rows[None, :, None], dt=DT)).any()
+
+
 def test_the_row_that_trains_weights_has_the_solver_of_refine():
     row = compose("train", ["experiment=highway/v_lstm_refined", "forecaster.frozen=rpi/v_lstm_epo"])
     assert build("solver", row["solver"]) == SOLVER
