@@ -101,7 +101,7 @@ def most_likely(logits: Float[Tensor, "B P"], matter: Bool[Tensor, "B P"], modes
         cost, kept = cost[:, :modes], kept[:, :modes]
         turned = turned.gather(1, (kept % modes)[..., None].expand_as(turned))
         turned[:, :, pair] = kept >= modes
-    rank = torch.arange(modes, device=logits.device) % (cost < torch.inf).sum(1, keepdim=True).clamp_min(1)
+    rank = torch.arange(modes, device=logits.device) % (cost < torch.inf).sum(1, keepdim=True)
     turned = turned.gather(1, rank[..., None].expand_as(turned))
     likeliest = torch.where(matter & (logits < 0), -1.0, 1.0).to(logits.dtype)[:, None]
     return torch.where(turned, -likeliest, likeliest)

@@ -45,6 +45,16 @@ def test_constant_velocity_is_right_about_agents_that_keep_theirs():
     assert found["alternative"] == pytest.approx({"ade": 0.5, "fde": 0.5})
 
 
+@pytest.mark.parametrize(("starts", "share"), [(8, 0.75), (0, 0.0)])
+def test_shares_of_starts_are_of_their_own_games(starts, share):
+    counts = {"main_converged": 3, "main_kept": 2, "main_starts": 4, "main_both": 1, "main_games": 2, "sub_games": 5}
+    found = report._solver(
+        {**counts, "sub_converged": share * starts, "sub_kept": 2, "sub_starts": starts, "sub_dropped": 1}, "newton"
+    )
+    assert (found["main_converged"], found["main_kept"], found["main_two_modes"]) == (0.75, 0.5, 0.5)
+    assert (found["sub_converged"], found["sub_kept"]) == (share, 2 / max(1, starts))
+
+
 def test_errors_are_means_over_steps_and_those_of_the_last_step():
     rows = straight()
     late = rows["states"][:, 0, ..., :2] + 0.1 * np.arange(1, FUTURE + 1)[:, None] * np.array([0.6, 0.8])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import polars as pl
@@ -20,6 +21,7 @@ from epo_lightning.data.simulate.lanelets import write_map
 from epo_lightning.data.simulate.layout import LAYOUTS
 from epo_lightning.data.simulate.leaders import FURTHEST_LEADER, leaders
 from epo_lightning.data.simulate.motion import Motion, move, savitzky_golay
+from epo_lightning.data.simulate.network import edges_of, write_network
 from epo_lightning.data.simulate.traffic import RATE, Traffic, simulate, simulator
 from epo_lightning.registry import ConfigError, lookup
 
@@ -225,6 +227,17 @@ def test_the_filter_keeps_cubics_and_their_derivatives():
     np.testing.assert_allclose(value, values[12:-12], atol=1e-6)
     np.testing.assert_allclose(rate[:, 0], 3 - 4 * inside + 1.5 * inside**2, atol=1e-6)
     np.testing.assert_allclose(second[:, 0], -4 + 3 * inside, atol=1e-5)
+
+
+def test_ramps_have_a_speed_limit_of_their_own(tmp_path: Path):
+    pytest.importorskip("libsumo", reason="the traffic simulator is not installed: pip install 'epo_lightning[sim]'")
+    edges = edges_of(LAYOUT)
+    net = ElementTree.parse(write_network(LAYOUT, edges, simulator()[1], tmp_path))
+    limits = {edge.get("id"): [float(lane.get("speed")) for lane in edge.findall("lane")] for edge in net.iter("edge")}
+    for edge in edges:
+        expected = LAYOUT.limit if edge.road == "main" else 90 / 3.6
+        assert limits[edge.name] == pytest.approx([expected] * len(edge.strips), abs=0.01)
+    assert {edge.road == "main" for edge in edges} == {True, False}
 
 
 def test_a_missing_simulator_is_named_with_the_remedy(monkeypatch: pytest.MonkeyPatch):

@@ -252,6 +252,20 @@ def test_absent_agents_do_not_change_solutions(minimise):
 
 
 @both
+def test_a_start_whose_largest_derivative_is_the_tolerance_is_a_solution(minimise):
+    energy = FeatureEnergy(["goal", "acc", "turnr"], [])
+    scene, game = feature_game(scenes=1, modes=1)
+    _, slope = gradient(energy, scene, game, game.initial_controls)
+    largest = float(slope.detach().abs().max())
+    assert slope.norm() > 1.1 * largest, "other entries are not zero"
+    stays, moves = (
+        dataclasses.replace(minimise, tolerance=share * largest)(energy, scene, game).controls for share in (1.01, 0.99)
+    )
+    assert torch.equal(stays, game.initial_controls)
+    assert not torch.equal(moves, game.initial_controls)
+
+
+@both
 def test_a_nan_sample_stops_at_its_start_and_leaves_the_others_unchanged(minimise):
     scene, game = convex_game(scenes=2, modes=2, agents=2)
     expected = minimise(convex_energy(), scene, game)

@@ -318,6 +318,8 @@ def test_folders_without_recordings_or_with_two_maps_are_refused(tmp_path):
         exid(tmp_path)
     write(tmp_path)
     (tmp_path / "maps/lanelet2/2_copy.osm").write_text(str(road()))
+    (tmp_path / "maps/lanelet2/2_aachen_brand.png").touch()
+    (tmp_path / "maps/lanelet2/2_folder.osm").mkdir()
     assert exid(tmp_path)[0].files[-1].name == "location2.osm"
     (tmp_path / "maps/lanelet2/2_aachen_brand/location2.osm").rename(tmp_path / "maps/lanelet2/2_other.osm")
     with pytest.raises(RecordingError, match=r"several maps of location 2 \(2_copy.osm, 2_other.osm\): keep one"):
