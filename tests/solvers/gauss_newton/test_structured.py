@@ -16,11 +16,18 @@ from epo_lightning.forecast import Status
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import OWN_FEATURES, PAIR_FEATURES, Source, own_feature, pair_feature
-from epo_lightning.scene import SPEED, TURN_RATE
+from epo_lightning.scene import ACCELERATION, SPEED, TURN_RATE
 from epo_lightning.solvers.backward import Implicit
 from epo_lightning.solvers.gauss_newton import structured
 from epo_lightning.solvers.gauss_newton.expansion import expand
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
+
+
+CURVED = {
+    "bent speed": (Source.SPEED, ACCELERATION),
+    "bent acceleration": (Source.CONTROL, ACCELERATION),
+    "bent rate": (Source.RATE, TURN_RATE),
+}
 
 
 def solve(energy, scene, parameters, steps=2, damping=10.0, **options):
@@ -210,6 +217,8 @@ def twins():
 
     own_feature("speed", Source.SPEED)(lambda z: z)
     own_feature("turn", Source.CONTROL, TURN_RATE)(lambda z: z)
+    for name, (source, channel) in CURVED.items():
+        own_feature(name, source, channel)(lambda z: torch.exp(0.3 * z))
     pair_feature("soft", Source.DISTANCE)(lambda distance, reach: torch.exp(reach - distance))
 
     @pair_feature("soft_undeclared")
@@ -237,6 +246,17 @@ def test_undeclared_features_have_the_solutions_of_declared_ones(twins, split, s
         return controls, [by[0], sum(by[2:-1]), by[-1]]
 
     assert_same(run(["both"], "soft_undeclared"), run(["speed", "turn", "goal"], "soft"), 1e-10)
+
+
+@pytest.mark.parametrize("ends", [None, (3, 5)])
+def test_functions_of_signals_have_the_gradients_of_a_dense_reference(twins, ends):
+    """Curved functions of speeds, controls and their rates; those of the package are straight on both sides of a bound."""
+    scene = random_scene(2, 2, history=2, dtype=torch.float64)
+    scene = dataclasses.replace(scene, game_steps=None if ends is None else torch.tensor(ends))
+    parameters = random_game(scene, 2, 6, own=("acc", *CURVED))
+    energy = FeatureEnergy(["acc", *CURVED])
+    found = with_gradients(lambda leaves: solve(energy, scene, leaves).controls, parameters)
+    assert_same(found, with_gradients(lambda leaves: dense(energy, scene, leaves), parameters), 1e-9)
 
 
 def test_undeclared_features_have_the_implicit_gradients_of_declared_ones(twins):
