@@ -45,6 +45,16 @@ def test_constant_velocity_is_right_about_agents_that_keep_theirs():
     assert found["alternative"] == pytest.approx({"ade": 0.5, "fde": 0.5})
 
 
+def test_the_nearest_neighbour_is_the_record_with_the_nearest_history_and_goals():
+    """Histories of the test are 0.3 m beside those of the training, and the goals of different records far from each other."""
+    train = {**straight(), "goals": 100.0 * np.arange(3.0)[:, None, None] * np.ones((3, 2, 2))}
+    test = {**train, "history": train["history"] + np.array([0.3, 0.0, 0.0, 0.0])}
+    found = report._nearest({"train": train, "test": test})
+    assert found["executed"] == pytest.approx({"ade": 0.0, "fde": 0.0})
+    assert found["alternative"] == pytest.approx({"ade": 0.0, "fde": 0.0})
+    assert found["rms_distance_per_step"]["0.5"] == pytest.approx(0.3)
+
+
 @pytest.mark.parametrize(("starts", "share"), [(8, 0.75), (0, 0.0)])
 def test_shares_of_starts_are_of_their_own_games(starts, share):
     counts = {"main_converged": 3, "main_kept": 2, "main_starts": 4, "main_both": 1, "main_games": 2, "sub_games": 5}

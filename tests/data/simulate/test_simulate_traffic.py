@@ -126,6 +126,14 @@ def test_the_tracks_have_all_columns_in_order(folder: Path, motion: Motion):
     assert set(meta["class"]) <= {"car", "van", "truck", "motorcycle"}
 
 
+def test_velocities_and_accelerations_are_also_given_along_and_to_the_left_of_the_heading(table: pl.DataFrame):
+    turned = np.exp(-1j * np.radians(table["heading"].to_numpy()))
+    for name in ("Velocity", "Acceleration"):
+        x, y, ahead, aside = (table[f"{way}{name}"].to_numpy() for way in ("x", "y", "lon", "lat"))
+        np.testing.assert_allclose((x + 1j * y) * turned, ahead + 1j * aside, atol=1e-3)
+    assert np.abs(table["latAcceleration"].to_numpy()).max() > 0.1
+
+
 def test_lanes_and_offsets_are_those_of_the_map(table: pl.DataFrame, read: Recording):
     tracks, lanes = read.tracks, read.lanes
     located = lanes.locate(tracks.position, tracks.heading)

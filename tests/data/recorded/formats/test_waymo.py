@@ -269,7 +269,7 @@ def test_invalid_scenarios_are_refused(tmp_path, content, message):
 def test_what_is_left_out_is_counted(tmp_path):
     tracks = [
         track(1, 9, moving(0.0, 2.0, 0.0, 5.0, (4.0, 2.0))),
-        track(2, 1, moving(0.0, 5.0, 0.0, 5.0, (0.0, 0.0))),
+        track(2, 1, moving(0.0, 5.0, 0.0, 5.0, (4.5, 0.0))),
         track(3, 2, [state(float(2 * k + 90 * (k > 50)), 9.0, 0.0, 20.0, (0.5, 0.5)) for k in range(91)]),
     ]
     features = [feature(1, 3, lane(line(0, 0, 50), mph=2000.0, entries=[77], left=[neighbour(78, 0, 5)]))]
