@@ -46,7 +46,7 @@ def test_constant_velocity_is_right_about_agents_that_keep_theirs():
 
 
 def test_the_nearest_neighbour_is_the_record_with_the_nearest_history_and_goals():
-    """Histories of the test are 0.3 m beside those of the training, and the goals of different records far from each other."""
+    """Histories of the test are 0.3 m beside those of the training, and their goals are far from each other."""
     train = {**straight(), "goals": 100.0 * np.arange(3.0)[:, None, None] * np.ones((3, 2, 2))}
     test = {**train, "history": train["history"] + np.array([0.3, 0.0, 0.0, 0.0])}
     found = report._nearest({"train": train, "test": test})

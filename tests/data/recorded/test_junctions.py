@@ -23,6 +23,7 @@ from epo_lightning.data.recorded.junctions import (
 from epo_lightning.data.recorded.lanes import SHOULDER, LaneGraph
 from epo_lightning.data.recorded.routes import BEHIND, BRAKING, PER_LINE, Routes, reach
 from epo_lightning.data.recorded.scenes import RecordedScenes
+from epo_lightning.data.recorded.summary import distance_to_goals
 from epo_lightning.data.recorded.surroundings import reachable_pieces
 from epo_lightning.data.recorded.windows import WindowConfig, extract, identifying
 from epo_lightning.registry import ConfigError
@@ -265,6 +266,17 @@ def test_scenes_have_the_lines_of_their_agents_and_masks_of_those_that_exist():
     assert torch.equal(scene.goal_mask.sum(-1), PER_LINE * count)
     assert torch.equal(scene.goal_mask, scene.reference_mask.repeat_interleave(PER_LINE, -1))
     assert scene.finite.all()
+
+
+def test_distances_to_goals_are_those_to_the_candidates_of_lines_that_exist():
+    scenes, _ = extract(recording(curve(900.0, 0.3)), WINDOWS)
+    assert (scenes.lines < WINDOWS.lines).all()
+    of_line = scenes.candidates.reshape(len(scenes.lines), scenes.references.shape[1], -1, 2)
+    expected = [
+        np.linalg.norm(of_line[agent, :count] - scenes.future[agent, -1, :2], axis=-1).min()
+        for agent, count in enumerate(scenes.lines)
+    ]
+    np.testing.assert_allclose(distance_to_goals(scenes), expected)
 
 
 def test_lanes_within_reach_equal_a_plain_loop():

@@ -22,7 +22,6 @@ from epo_lightning.solvers.gauss_newton import structured
 from epo_lightning.solvers.gauss_newton.expansion import expand
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
-
 CURVED = {
     "bent speed": (Source.SPEED, ACCELERATION),
     "bent acceleration": (Source.CONTROL, ACCELERATION),
