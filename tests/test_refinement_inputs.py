@@ -195,6 +195,15 @@ def test_absent_agents_may_have_any_numbers() -> None:
             assert refine(padded, torch.ones(1, 1), alone).states[:, :, 0].isfinite().all()
 
 
+@pytest.mark.parametrize("channel", range(4))
+def test_a_present_state_with_one_number_that_is_not_finite_is_refused(channel: int) -> None:
+    states, scene = crossing_at()
+    history = scene.history.clone()
+    history[0, 1, -1, channel] = math.inf
+    with pytest.raises(ValueError, match=r"scene\.history\[0, 1, -1\] is not finite: mark the agent as absent"):
+        refine(states, torch.ones(1, 1), dataclasses.replace(scene, history=history))
+
+
 def test_negative_weights_and_names_of_derivatives_are_refused() -> None:
     states, scene = crossing_at()
     with pytest.raises(ValueError, match=r"weights\['circles'\] must be 0 or more, not -20"):
