@@ -199,7 +199,7 @@ def test_absent_agents_may_have_any_numbers() -> None:
 def test_a_present_state_with_one_number_that_is_not_finite_is_refused(channel: int) -> None:
     states, scene = crossing_at()
     history = scene.history.clone()
-    history[0, 1, -1, channel] = math.inf
+    history[0, 1, -1, channel] = math.nan
     with pytest.raises(ValueError, match=r"scene\.history\[0, 1, -1\] is not finite: mark the agent as absent"):
         refine(states, torch.ones(1, 1), dataclasses.replace(scene, history=history))
 
