@@ -144,7 +144,7 @@ class Softness(NamedTuple):
     """Power, relaxation and temperature of an imitation loss at an optimisation step; the defaults are the paper's loss.
 
     Attributes:
-        power: exponent of :func:`distances`.
+        power: 1 for Euclidean distances; above, exponent of each coordinate's error (:func:`distances`).
         relaxation: share of the mean over modes (:class:`Relaxation`).
         temperature: temperature [m] of the soft minimum (:class:`Annealing`); 0 for the minimum.
     """
@@ -159,7 +159,7 @@ class ImitationSchedule:
     """Schedule of an imitation loss: how it changes during training.
 
     Attributes:
-        power: exponent of :func:`distances`.
+        power: 1 for Euclidean distances; above, exponent of each coordinate's error (:func:`distances`).
         relaxation, annealing: schedules of the share of the mean, and of the temperature.
 
     Raises:

@@ -25,8 +25,8 @@ def read(schema: type[Section], values: Mapping[str, Any], where: str = "") -> S
         if key not in hints:
             raise ConfigError(f"unknown key {prefix}{key}: {nearest(str(key), hints)}")
     for entry in dataclasses.fields(schema):  # type: ignore[arg-type]
-        has_default = not entry.default is entry.default_factory is dataclasses.MISSING
-        if entry.name not in values and not has_default:
+        required = entry.default is dataclasses.MISSING and entry.default_factory is dataclasses.MISSING
+        if required and entry.name not in values:
             raise ConfigError(f"missing key {prefix}{entry.name}")
     return schema(**{key: _read(hints[key], value, prefix + key) for key, value in values.items()})
 

@@ -7,7 +7,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from epo_lightning.decoders.mlp import MLP
-from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.scene import HEADING, rotated
 
 
@@ -120,13 +119,3 @@ PROBABILITIES: dict[str, type[SceneProbabilities] | type[PairwiseProbabilities]]
     "pairwise": PairwiseProbabilities,
 }
 """Decoders of mode probabilities by their name in the configuration; ``linear`` is the paper's."""
-
-
-def check_probabilities(name: str) -> None:
-    """Refuse an unknown decoder of mode probabilities.
-
-    Raises:
-        ConfigError: the message names the nearest known one.
-    """
-    if name not in PROBABILITIES:
-        raise ConfigError(f"unknown forecaster.probabilities {name!r}: {nearest(str(name), PROBABILITIES)}")

@@ -123,11 +123,14 @@ class ForecastPlanner:
 
     Forecasts without controls are tracked with the unicycle (:func:`~epo_lightning.refinement.game.track`).
 
+    Where games are solved again (``warm``, ``pair_terms=False``), modes keep the probabilities of the forecast, which were
+    decoded from its own solutions.
+
     Args:
         forecaster: any forecaster.
         agents: number of agents that it is shown, the first ones of each scene; None for all.
         pair_terms: False to switch the pair terms of the inferred games off, for forecasters with such a game.
-        warm: whether the solver also starts at the shifted strategies of the last step, instead of the decoded ones.
+        warm: whether the solver starts at the shifted strategies of the last step instead of the decoded ones.
         keep: whether the mode is the one whose plan is nearest to the last plan, instead of the most likely one.
 
     Raises:

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from epo_lightning.checks import check_choice, check_number
-from epo_lightning.decoders.probabilities import check_probabilities
+from epo_lightning.decoders.probabilities import PROBABILITIES
 from epo_lightning.forecasters.calibration import Calibration
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.energy import FEATURES, Energy
@@ -159,7 +159,7 @@ def decodes_probabilities(probabilities: str, energy: Energy, solver: Minimiser)
     Raises:
         ConfigError: an unknown decoder, or a chosen one where none is used.
     """
-    check_probabilities(probabilities)
+    check_choice("forecaster.probabilities", probabilities, PROBABILITIES)
     chooses = TABLES in solver.provides
     defined = chooses or energy.pair_order is not None
     if defined and probabilities != "linear":

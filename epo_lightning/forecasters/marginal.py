@@ -31,7 +31,8 @@ class Marginal(Forecaster):
         loss_weights: lambda of ``imitation`` and ``probability``.
         relaxation, relaxation_steps: see :class:`~epo_lightning.losses.Relaxation`.
         annealing, annealing_steps: temperature [m] and duration of an :class:`~epo_lightning.losses.Annealing`.
-        power: exponent of the distances (:func:`~epo_lightning.losses.distances`).
+        power: 1 for Euclidean distances; above, exponent of each coordinate's error; see
+            :func:`~epo_lightning.losses.distances`.
     """
 
     def __init__(

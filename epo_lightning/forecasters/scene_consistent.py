@@ -6,7 +6,8 @@ from collections.abc import Mapping
 
 from epo_lightning import losses
 from epo_lightning.backbones.base import Backbone
-from epo_lightning.decoders.probabilities import PROBABILITIES, check_probabilities
+from epo_lightning.checks import check_choice
+from epo_lightning.decoders.probabilities import PROBABILITIES
 from epo_lightning.decoders.strategies import InitialStrategies
 from epo_lightning.forecast import JointForecast
 from epo_lightning.forecasters.base import Forecaster
@@ -31,7 +32,8 @@ class SceneConsistent(Forecaster):
         control_scale: control at a network output of one.
         relaxation, relaxation_steps: see :class:`~epo_lightning.losses.Relaxation`.
         annealing, annealing_steps: temperature [m] and duration of an :class:`~epo_lightning.losses.Annealing`.
-        power: exponent of the distances (:func:`~epo_lightning.losses.distances`).
+        power: 1 for Euclidean distances; above, exponent of each coordinate's error; see
+            :func:`~epo_lightning.losses.distances`.
         probabilities: decoder of the modes' probabilities, ``linear`` (the paper's) or ``pairwise``
             (:mod:`~epo_lightning.decoders.probabilities`).
     """
@@ -52,7 +54,7 @@ class SceneConsistent(Forecaster):
         power: float = 1.0,
         probabilities: str = "linear",
     ) -> None:
-        check_probabilities(probabilities)
+        check_choice("forecaster.probabilities", probabilities, PROBABILITIES)
         super().__init__(task, optimizer)
         self.backbone = backbone
         self.dynamics = dynamics

@@ -149,16 +149,16 @@ class FeatureInputs(Energy):
             assert parameters.reference_controls is not None
             reference_controls = torch.where(present[:, None, :, None, None], parameters.reference_controls, 0.0)
         return Surroundings(
-            self.current_states(scene),
-            scene.dt,
-            goals,
-            line,
-            reference_speed,
-            wheelbase,
-            headings,
-            scene.game_steps,
-            reference_controls,
-            self._bounds_of(scene),
+            initial=self.current_states(scene),
+            dt=scene.dt,
+            goals=goals,
+            line=line,
+            reference_speed=reference_speed,
+            wheelbase=wheelbase,
+            goal_headings=headings,
+            ends=scene.game_steps,
+            reference_controls=reference_controls,
+            bounds=self._bounds_of(scene),
         )
 
     def _bounds_of(self, scene: Scene) -> Bounds:

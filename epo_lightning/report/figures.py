@@ -30,7 +30,6 @@ def joint_predictions(
     forecasts: Mapping[str, JointForecast],
     path: str | Path,
     alternatives: Float[Tensor, "B N K 4"] | None = None,
-    agents: Sequence[str] = AGENTS,
 ) -> Path:
     """Figure of all joint modes of several forecasters, one scene per row, one forecaster per column. Returns its path.
 
@@ -43,7 +42,6 @@ def joint_predictions(
         forecasts: forecasts of these scenes, by the name of the row in the tables.
         path: path of the PNG.
         alternatives: alternative futures (the other equilibrium); nan for scenes without one.
-        agents: names of the agents.
 
     Raises:
         ValueError: there is no forecast, or the scenes have no future.
@@ -63,7 +61,7 @@ def joint_predictions(
             for row in range(rows):
                 panels[row, column].set_aspect("equal", adjustable="box")
                 other = None if alternatives is None else alternatives[row]
-                _draw_scene(panels[row, column], scene[row], other, agents if column == 0 else ())
+                _draw_scene(panels[row, column], scene[row], other, AGENTS if column == 0 else ())
                 _draw_modes(panels[row, column], scene[row], forecast[row])
         for row in range(rows):
             panels[row, 0].set_ylabel("y [m]")

@@ -17,8 +17,8 @@ ALL = "all"
 """Name of the split that has all recordings, for tests of forecasters that learned on other data."""
 SEEDS, SUGGESTED = 100, 3
 """Number of seeds that are tried where a split is empty, and largest number of those that an error suggests."""
-NAMED = 12
-"""Largest number of recordings that an error lists."""
+NAMED, LONGEST = 12, 1500
+"""Largest number of recordings that an error lists, and of characters of a sentence in it."""
 
 
 @dataclass(frozen=True)
@@ -172,7 +172,7 @@ def _some(names: Sequence[str]) -> str:
     return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "") or "none"
 
 
-def _sentence(text: str, most: int = 1500) -> str:
-    """A text of at most ``most`` characters that begins with a capital letter."""
-    text = text if len(text) <= most else text[:most] + " ..."
+def _sentence(text: str) -> str:
+    """A text of at most ``LONGEST`` characters that begins with a capital letter."""
+    text = text if len(text) <= LONGEST else text[:LONGEST] + " ..."
     return text[:1].upper() + text[1:]

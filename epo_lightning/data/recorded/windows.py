@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Int
 
+from epo_lightning.checks import check_number, check_whole
 from epo_lightning.data.errors import RecordingError
 from epo_lightning.data.recorded.clock import TOO_SHORT, Stretches, stretches
 from epo_lightning.data.recorded.junctions import Junctions
@@ -40,7 +41,9 @@ MOST_AGENTS, MOST_LINES, MOST_LANES, LONGEST_SMOOTHING = 64, 64, 4096, 10.0
 """Largest numbers of agents of a scene, lines of an agent and lane polylines, and largest length [s] of smoothing."""
 MOMENTS, AT_ENDS = "agents at steps of the clock", "near the beginning or end of a track"
 """Names of counts: possible windows, one per agent and step, and those whose agent is not observed in the whole window."""
-REASONS = ("too few agents around", "the same agents twice", "no lane change", "an agent on no lane")
+TOO_FEW, TWICE = "too few agents around", "the same agents twice"
+NO_CHANGE, NO_LANE = "no lane change", "an agent on no lane"
+REASONS = (TOO_FEW, TWICE, NO_CHANGE, NO_LANE)
 """Reasons for which windows are left out, in the order of the filters."""
 CHUNK = 4_000_000
 """Largest number of distances between agents that are computed at once, to bound the memory."""
@@ -98,16 +101,10 @@ class WindowConfig:
             ("lanes", 1),
             ("lines", 1),
         ):
-            value = getattr(self, name)
-            if value is not None and value < least:
-                raise ConfigError(f"data.windows.{name} must be {least} or more, not {getattr(self, name)}")
-        for name in ("dt", "speed_limit"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise ConfigError(f"data.windows.{name} must be positive, not {getattr(self, name)}")
-        for name in ("radius", "smoothing"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < np.inf:
-                raise ConfigError(f"data.windows.{name} must be positive, or null for none, not {value}")
+            if (value := getattr(self, name)) is not None:
+                check_whole(f"data.windows.{name}", value, least)
+        for name in ("dt", "speed_limit", "radius", "smoothing"):
+            check_number(f"data.windows.{name}", getattr(self, name), null=name in ("radius", "smoothing"))
         if self.lanes is not None and self.lanes > MOST_LANES:
             raise ConfigError(
                 f"data.windows.lanes must be {MOST_LANES} or less, or null for all that an agent may reach, not {self.lanes}"
@@ -172,7 +169,7 @@ def extract(recording: Recording, config: WindowConfig) -> tuple[SceneTables | N
     counts[AT_ENDS] = observed - counts["windows"]
     if recording.lanes is not None:
         off = ((located.lane[_rows(clock, moments, members)] < 0) & (members >= 0)).any(1)
-        counts["an agent on no lane"] += int(off.sum())
+        counts[NO_LANE] += int(off.sum())
         moments, members = moments[~off], members[~off]
     counts["scenes"] = len(moments)
     if not len(moments):
@@ -237,11 +234,11 @@ def _choose(
         members, moments = members[focal], np.broadcast_to(moment[:, None], focal.shape)[focal]
         counts["windows"] += len(moments)
         enough = (members >= 0).sum(1) >= config.least_agents
-        counts["too few agents around"] += int((~enough).sum())
+        counts[TOO_FEW] += int((~enough).sum())
         members, moments = members[enough], moments[enough]
         _, once = np.unique(np.column_stack([moments, np.sort(members, 1)]), axis=0, return_index=True)
         once.sort()
-        counts["the same agents twice"] += len(moments) - len(once)
+        counts[TWICE] += len(moments) - len(once)
         found_moments.append(moments[once])
         found_members.append(members[once])
     moments, members = np.concatenate(found_moments), np.concatenate(found_members)
@@ -251,7 +248,7 @@ def _choose(
         after = np.clip((moments + config.horizon)[:, None], first, last)
         offset = clock.start[members] - first
         changed = ((changes[offset + after] > changes[offset + before]) & (members >= 0)).any(1)
-        counts["no lane change"] += int((~changed).sum())
+        counts[NO_CHANGE] += int((~changed).sum())
         moments, members = moments[changed], members[changed]
     return moments, members
 
@@ -270,7 +267,7 @@ def _crowds(
     on = usable[clock.start[stretch] + moment - clock.first[stretch]]
     if left_out := int((kept & focal & ~on).sum()):
         counts["windows"] += left_out
-        counts["an agent on no lane"] += left_out
+        counts[NO_LANE] += left_out
     kept &= on
     stretch, moment, focal = stretch[kept], moment[kept], focal[kept]
     order = np.argsort(moment, kind="stable")

@@ -28,6 +28,12 @@ AGENTS = 2
 ROBOT, PEDESTRIAN = range(AGENTS)
 DISC_RADIUS = 0.25
 """Radius of an agent's body [m] (App. "Energy Features")."""
+DISC_DIAMETER = 2 * DISC_RADIUS
+"""Length and width of an agent [m]; agents that are nearer to each other overlap."""
+HISTORY = 18
+"""Steps before the current state (1.8 s); with the current state, a history has 19 states."""
+FUTURE = 40
+"""Future steps (4 s)."""
 RECIPE = 2
 """Version of the method: raised whenever the same configuration would give other records. Version 1 can still be made."""
 FIRST_ANGLE = 1_000_004

@@ -10,20 +10,18 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from epo_lightning.data.rpi.game import DISC_RADIUS, GameConstants
+from epo_lightning.data.rpi.game import DISC_DIAMETER, GameConstants
 from epo_lightning.data.rpi.solve import Solutions
 
 CLASSES = (1, -1)
 """Signs of the rotation of the line of sight."""
-SMALLEST_DISTANCE = 2 * DISC_RADIUS
-"""Distance of the agents' centres [m] at which their discs touch."""
 TIE = 1e-6
 """Relative difference of costs below which the solution from the earlier start strategy is taken."""
 
 
 def admissible(solutions: Solutions, constants: GameConstants) -> NDArray[np.bool_]:
     """Mask [S] of the solutions that may become modes: converged, without contact, without driving backwards."""
-    return solutions.converged & (solutions.distance > SMALLEST_DISTANCE) & (solutions.speed >= constants.speed_min)
+    return solutions.converged & (solutions.distance > DISC_DIAMETER) & (solutions.speed >= constants.speed_min)
 
 
 def cheapest(solutions: Solutions, constants: GameConstants) -> dict[int, int]:

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from epo_lightning.data.cache import SPLITS
-from epo_lightning.data.rpi.game import DISC_RADIUS, Array, GameConstants, generator
-from epo_lightning.data.rpi.subgames import FUTURE, HISTORY, Records
+from epo_lightning.data.rpi.game import DISC_DIAMETER, FUTURE, HISTORY, Array, GameConstants, generator
+from epo_lightning.data.rpi.subgames import Records
 
 BINS = ((18, 28), (28, 38), (38, 48), (48, 61))
 """Ranges [first, end) of the step k of the current state; steps 18 .. 27 are 1.8 .. 2.7 s after the start."""
@@ -131,7 +131,7 @@ def _motion(rows: Records, weights: Array) -> dict[str, Any]:
     return {
         "distance_executed": _quantiles(executed),
         "distance_alternative": _quantiles(alternative),
-        "disc_overlaps": int((executed < 2 * DISC_RADIUS).sum() + (alternative < 2 * DISC_RADIUS).sum()),
+        "disc_overlaps": int((executed < DISC_DIAMETER).sum() + (alternative < DISC_DIAMETER).sum()),
         "median_distance_by_weight": by_weight,
         "sade_between_modes": _quantiles(apart),
         "acceleration_99": float(np.quantile(np.abs(acceleration), 0.99)),

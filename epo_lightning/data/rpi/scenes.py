@@ -14,7 +14,7 @@ from epo_lightning.checks import check_choice, check_whole
 from epo_lightning.data import cache
 from epo_lightning.data.cache import SPLITS
 from epo_lightning.data.datamodule import SceneDataModule, epoch_generator
-from epo_lightning.data.rpi.game import DISC_RADIUS, RECIPE, GameConstants
+from epo_lightning.data.rpi.game import AGENTS, DISC_DIAMETER, FUTURE, HISTORY, RECIPE, GameConstants
 from epo_lightning.data.rpi.splits import PAPER_SIZES, RULES
 from epo_lightning.registry import ConfigError, register
 from epo_lightning.scene import Scene
@@ -23,8 +23,6 @@ from epo_lightning.task import Task
 TARGETS = ("executed", "sampled", "both")
 SOLVERS = ("potential", "feedback", "feedback_converged")
 SUBSETS = ("executed", "alternative")
-DISC_DIAMETER = 2 * DISC_RADIUS
-"""Length and width [m] of an agent."""
 
 
 class RPIDataset:
@@ -107,12 +105,11 @@ class RPIData(SceneDataModule):
         share: share of the scenes of every split that is used, drawn once.
         games_share: share of the training split's games that is used, drawn once; a game is a start of the pedestrian in a
             main game. Smaller shares are contained in larger ones; validation and test stay whole.
-        recipe: version of the method, 2; or 1, in which the angle of the first placement is a function of w. The default is
-            that of runs that were trained before this was a setting; ``conf/data/rpi.yaml`` has 2.
+        recipe: version of the method, 2; or 1, in which the angle of the first placement is a function of w.
     """
 
-    num_agents, history = 2, 19
-    task = Task(horizon=40, dt=0.1, subsets=SUBSETS, history=history)
+    num_agents, history = AGENTS, HISTORY + 1
+    task = Task(horizon=FUTURE, dt=GameConstants.dt, subsets=SUBSETS, history=history)
 
     def __init__(
         self,
@@ -127,7 +124,7 @@ class RPIData(SceneDataModule):
         batch_size: int = 32,
         share: float = 1.0,
         games_share: float = 1.0,
-        recipe: int = 1,
+        recipe: int = RECIPE,
     ) -> None:
         super().__init__(batch_size, seed, share)
         check_whole("data.recipe", recipe)

@@ -12,15 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from epo_lightning.data.rpi.game import AGENTS, Array, GameConstants, MainGame, generator
+from epo_lightning.data.rpi.game import AGENTS, FUTURE, HISTORY, Array, GameConstants, MainGame, generator
 from epo_lightning.data.rpi.kernels import costs, passage, potential_gradient
 from epo_lightning.data.rpi.modes import admissible, cheapest
 from epo_lightning.data.rpi.solve import PotentialSettings, solve, solve_potential
 
-HISTORY = 18
-"""Steps before the current state (1.8 s); with the current state, a history has 19 states."""
-FUTURE = 40
-"""Future steps (4 s)."""
 MAIN_STARTS = 12
 """Start strategies of a main game."""
 RANDOM_STARTS = 14

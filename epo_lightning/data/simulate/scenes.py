@@ -84,6 +84,9 @@ class SimulatedHighway(RecordedData):
         for name, value in defaults.items():
             if self.simulation[name] != value:
                 words.append(f"data.{name}={self.simulation[name]}".replace(" ", ""))
+        traffic = self.simulation.get("traffic", "free")
+        if (self.dataset_name, traffic) != ("highway_sim", "free"):  # another file of conf/data may set it
+            words.append(f"data.traffic={traffic}")
         if self.root != cache.default_root():
             words.append(f"data.root={self.root}")
         return shlex.join(["epo", "generate", *words])

@@ -29,23 +29,20 @@ BINS = 10
 """Number of bins of equal width."""
 
 
-def reliability(
-    probabilities: Float[Tensor, "B M"], closest: Int[Tensor, " B"], bins: int = BINS
-) -> Float[Tensor, "B {bins} 3"]:
+def reliability(probabilities: Float[Tensor, "B M"], closest: Int[Tensor, " B"]) -> Float[Tensor, "B bins 3"]:
     """Number of statements, sum of their probabilities and number of true ones, by scene and bin, in float64.
 
-    Bin b holds the probabilities from b / bins up to, but without, (b + 1) / bins; the last bin also holds 1.
+    Bin b holds the probabilities from b / BINS up to, but without, (b + 1) / BINS; the last bin also holds 1.
 
     Args:
         probabilities: probabilities of the joint modes.
         closest: index of the mode that is the closest to the future.
-        bins: number of bins.
     """
     probabilities = probabilities.double()
-    index = (probabilities * bins).long().clamp(0, bins - 1)
+    index = (probabilities * BINS).long().clamp(0, BINS - 1)
     true = torch.nn.functional.one_hot(closest, probabilities.shape[1]).double()
     values = torch.stack((torch.ones_like(probabilities), probabilities, true), -1)  # B M 3
-    return torch.nn.functional.one_hot(index, bins).double().mT @ values
+    return torch.nn.functional.one_hot(index, BINS).double().mT @ values
 
 
 def expected_calibration_error(totals: Float[Tensor, "*groups bins 3"]) -> Float[Tensor, "*groups"]:

@@ -96,18 +96,25 @@ def choose(
     if name == "pytorch":
         return structured
     layer = hosted.cpu_layer(energy)
-    automatic = layer if parameters.initial_controls.device.type == "cpu" else hosted
-    own_features = energy.custom is not None
-    if automatic is hosted and fixed and (own_features or fused.obstacle(energy, scene, parameters) is None):
-        automatic = fused
-    chosen = {"compiled": layer, "host": hosted, "warp": fused}.get(name, automatic)
+    chosen = {"compiled": layer, "host": hosted, "warp": fused}.get(name)
+    if chosen is None and parameters.initial_controls.device.type == "cpu":
+        chosen = layer
+    elif chosen is None and fixed and energy.custom is not None:
+        return _replaced("the fused kernels do not know features of your own")
+    elif chosen is None:
+        chosen = fused if fixed and fused.obstacle(energy, scene, parameters) is None else hosted
     obstacle = chosen.obstacle(energy, scene, parameters)
     if obstacle is None:
         return chosen
     if name != "auto":
         raise ValueError(f"solver.backend is {name!r}, but {obstacle}; 'auto' and 'pytorch' can solve this game")
+    return _replaced(obstacle)
+
+
+def _replaced(reason: str) -> Backend:
+    """Plain PyTorch in the place of a kernel, with a warning of the reason."""
     if not torch.compiler.is_exporting():
-        say_once(obstacle)
+        say_once(reason)
     return structured
 
 

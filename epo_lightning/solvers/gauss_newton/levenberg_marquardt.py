@@ -26,9 +26,9 @@ from epo_lightning.solvers.gauss_newton import adaptive, backends
 from epo_lightning.solvers.general import descent
 
 LARGEST_DAMPING = 1e30
-_FAR, _NEAR = 5, 15
+_FIRST_STEPS, _NEWTON_STEPS = 5, 15
 """Numbers of Gauss-Newton and of Newton steps that lead to a minimum. Newton steps converge only from a start near it."""
-_LIGHT = 1e-2
+_LARGEST_NEWTON_DAMPING = 1e-2
 """Largest first damping near a minimum: with more of it, the first Newton steps are short."""
 
 
@@ -115,13 +115,13 @@ class LevenbergMarquardt(Stepwise):
         Solvers that are not adaptive, and those of a backend without Newton steps, stay as they are."""
         if self.newton_steps or not self.adaptive or self.backend == "warp":
             return self
-        return dataclasses.replace(self, steps=min(self.steps, _FAR), newton_steps=_NEAR)
+        return dataclasses.replace(self, steps=min(self.steps, _FIRST_STEPS), newton_steps=_NEWTON_STEPS)
 
     def near_minimum(self) -> LevenbergMarquardt:
         """The solver without its Gauss-Newton steps, if it has Newton steps, which converge quadratically near a minimum."""
         if not self.newton_steps:
             return self
-        return dataclasses.replace(self, steps=0, damping=min(self.damping, _LIGHT))
+        return dataclasses.replace(self, steps=0, damping=min(self.damping, _LARGEST_NEWTON_DAMPING))
 
     def __call__(self, energy: Energy, scene: Scene, parameters: GameParameters) -> Solution:
         """S steps, and then the Newton steps.

@@ -17,7 +17,7 @@ from epo_lightning.game.energy import Energy
 from epo_lightning.host import readable
 from epo_lightning.scene import Scene
 
-_FAR, _TINY = 1e-3, 1e-6
+_LARGEST_DECREMENT, _TINY = 1e-3, 1e-6
 """Largest Newton decrement of a minimum: relative to the energy, and absolute."""
 _warned = False
 _ROUNDING = 8.0
@@ -128,13 +128,14 @@ def warn_if_far(
     if _warned or not definite.numel() or not readable(definite):
         return
     with torch.no_grad():
-        far = ~(definite & (decrement <= _FAR * value.abs() + _TINY))
+        far = ~(definite & (decrement <= _LARGEST_DECREMENT * value.abs() + _TINY))
         share = far.double().mean().item()
     if share > 0.5:
         _warned = True
         warnings.warn(
             f"backward=implicit: {100 * share:.0f} % of the solutions of a batch are no minima (a Newton decrement of more "
-            f"than {100 * _FAR:g} % of the energy, or a Hessian that is not positive definite), so their gradients are "
-            "wrong: increase solver.steps, set solver.adaptive=true where the solver has it, or choose backward=unrolled",
+            f"than {100 * _LARGEST_DECREMENT:g} % of the energy, or a Hessian that is not positive definite), so their "
+            "gradients are wrong: increase solver.steps, set solver.adaptive=true where the solver has it, or choose "
+            "backward=unrolled",
             stacklevel=2,
         )

@@ -76,7 +76,8 @@ class Newton(Minimiser):
 
     def _advanced(self, energy: Energy, scene: Scene, parameters: GameParameters, now: _Iterate) -> _Iterate:
         """The iterates after one more Hessian."""
-        controls, value, slope, damping, status, done = vars(now).values()
+        controls, value, slope = now.controls, now.value, now.slope
+        damping, status, done = now.damping, now.status, now.done
         matrix = hessian(energy, scene, parameters, controls)
         known = matrix.flatten(2).sum(-1).isfinite()
         status = torch.where(done | known, status, int(Status.STOPPED))

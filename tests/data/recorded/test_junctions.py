@@ -303,7 +303,7 @@ def test_lanes_within_reach_equal_a_plain_loop():
 def test_settings_of_junctions_enter_the_identity_of_a_data_set_only_where_they_are_used():
     assert "lines" not in identifying(WindowConfig())
     assert identifying(WINDOWS)["lines"] == 9
-    with pytest.raises(ConfigError, match=r"data\.windows\.lines must be 1 or more, not 0"):
+    with pytest.raises(ConfigError, match=r"data\.windows\.lines must be a whole number, 1 or more, not 0"):
         WindowConfig(lines=0)
 
 

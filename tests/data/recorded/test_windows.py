@@ -303,13 +303,14 @@ def test_joined_scenes_are_the_same_scenes():
     [
         ("agents", 65, "agents must be 64 or less"),
         ("lanes", 10**6, "lanes must be 4096 or less, or null for all that an agent may reach"),
-        ("horizon", 1, "horizon must be 2 or more"),
+        ("horizon", 1, "horizon must be a whole number, 2 or more"),
         ("smoothing", 1e9, "smoothing must be 10 s or less"),
-        ("history", 1, "data.windows.history must be 2 or more"),
-        ("agents", 0, "data.windows.agents must be 1"),
+        ("history", 1, "data.windows.history must be a whole number, 2 or more, not 1"),
+        ("agents", 0, "data.windows.agents must be a whole number, 1 or more, not 0"),
+        ("history", 10.5, "data.windows.history must be a whole number, 2 or more, not 10.5"),
         ("least_agents", 5, "must not be more than"),
-        ("radius", -1.0, "positive, or null"),
-        ("dt", 0.0, "data.windows.dt must be positive"),
+        ("radius", -1.0, "data.windows.radius must be a number, positive, and finite, or null, not -1.0"),
+        ("dt", 0.0, "data.windows.dt must be a number, positive, and finite, not 0.0"),
     ],
 )
 def test_invalid_window_settings_are_refused(key, value, message):

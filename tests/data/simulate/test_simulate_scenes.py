@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import shutil
 from pathlib import Path
 from typing import Any
@@ -28,3 +29,19 @@ def test_scenes_are_extracted_from_simulated_recordings(tmp_path: Path, monkeypa
     assert folder.parent == tmp_path
     assert len(data.dataset("train")) > 0
     assert data.generate(workers=1, progress=False) == folder
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["data=highway_sim"],
+        ["data=highway_sim_dense"],
+        ["data=highway_sim", "data.traffic=dense", "data.minutes=2.0", "data.layouts=[1,2]"],
+        ["data=highway_sim_dense", "data.traffic=free", "data.recordings=2", "data.seed=3"],
+    ],
+)
+def test_the_command_of_a_data_set_makes_the_same_traffic(words: list[str]) -> None:
+    data = build_data(compose("generate", words)["data"])
+    epo, generate, *named = shlex.split(data.command)
+    assert (epo, generate) == ("epo", "generate")
+    assert build_data(compose("generate", named)["data"]).folder_of_recordings == data.folder_of_recordings

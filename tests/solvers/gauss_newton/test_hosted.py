@@ -253,7 +253,7 @@ def test_fixed_steps_with_features_of_the_user_stay_on_the_device(own_features):
     """A CUDA graph can contain them there."""
     energy, scene, game = own_features
     backends.say_once.cache_clear()
-    with pytest.warns(UserWarning, match="the fused layer"):
+    with pytest.warns(UserWarning, match=r"do not know features of your own\. Plain PyTorch does the same"):
         assert backends.choose("auto", energy, remote(scene), remote(game), fixed=True) is structured
     assert backends.choose("auto", energy, remote(scene), remote(game)) is hosted
     assert backends.choose("host", energy, remote(scene), remote(game), fixed=True) is hosted
