@@ -14,6 +14,9 @@ from epo_lightning.data.recorded.recordings import RecordedData
 from epo_lightning.data.recorded.tracks import Recording, RecordingSource
 from epo_lightning.registry import ConfigError, register
 
+TRAFFIC = {"highway_sim": "free", "highway_sim_dense": "dense"}
+"""Style of the traffic of every simulated data set in ``conf/data``."""
+
 
 @register("data", "highway_sim")
 class SimulatedHighway(RecordedData):
@@ -47,6 +50,7 @@ class SimulatedHighway(RecordedData):
         batch_size: int = 32,
         share: float = 1.0,
     ) -> None:
+        self.traffic = traffic
         self.simulation = simulate.config(seed, recordings, minutes, layouts, traffic)
         home = Path(root).expanduser() if root else cache.default_root()
         super().__init__(
@@ -84,9 +88,8 @@ class SimulatedHighway(RecordedData):
         for name, value in defaults.items():
             if self.simulation[name] != value:
                 words.append(f"data.{name}={self.simulation[name]}".replace(" ", ""))
-        traffic = self.simulation.get("traffic", "free")
-        if (self.dataset_name, traffic) != ("highway_sim", "free"):  # another file of conf/data may set it
-            words.append(f"data.traffic={traffic}")
+        if TRAFFIC.get(self.dataset_name) != self.traffic:
+            words.append(f"++data.traffic={self.traffic}")  # whether or not the file of the data set has this setting
         if self.root != cache.default_root():
             words.append(f"data.root={self.root}")
         return shlex.join(["epo", "generate", *words])

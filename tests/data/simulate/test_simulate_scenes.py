@@ -36,7 +36,7 @@ def test_scenes_are_extracted_from_simulated_recordings(tmp_path: Path, monkeypa
     [
         ["data=highway_sim"],
         ["data=highway_sim_dense"],
-        ["data=highway_sim", "data.traffic=dense", "data.minutes=2.0", "data.layouts=[1,2]"],
+        ["data=highway_sim", "+data.traffic=dense", "data.minutes=2.0", "data.layouts=[1,2]"],
         ["data=highway_sim_dense", "data.traffic=free", "data.recordings=2", "data.seed=3"],
     ],
 )
