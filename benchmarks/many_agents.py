@@ -7,7 +7,7 @@
 The words choose data, as for ``epo generate``. Of the scenes of the test split with the most agents, each of N agents is
 made of the focal agent and its N - 1 nearest neighbours. The game is the one of a refinement: every agent intends to keep
 its velocity, a deviation has a cost, and bodies do not overlap and keep a headway (vehicles) or a clearance (discs). It is
-solved by ten adaptive steps with all pairs and with those that each gate chooses.
+solved by the steps of a refinement with all pairs and with those that each gate chooses.
 
 For each: pairs per agent; the largest group of agents that chosen pairs connect; CPU times per scene in milliseconds of
 decoding five modes' pair weights from features of agents, of choosing the pairs and solving the game, and of the layer in
