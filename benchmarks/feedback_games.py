@@ -94,13 +94,15 @@ def solve(title: str, solver: Feedback, games: Games, exact: Solution | None = N
     with counted() as numbers:
         found = solver(games.energy, games.records.scene, games.parameters)
     spent = 1e3 * (time.process_time() - start) / len(found.status)
-    solved = found.status == Status.SOLVED
+    solved = found.status == Status.COMPLETED
     line = f"{title:28} solved {int(solved.sum())} of {solved.numel()}"
     if numbers:
         line += f"  {sum(numbers) / solved.numel():5.1f} LQ games each"
     if exact is not None:
         far = (found.states - exact.states)[..., :FUTURE, :].abs().amax((2, 3, 4))
-        line += f"  {spent:5.1f} ms of CPU per record  error {quantiles(far[solved & (exact.status == Status.SOLVED)])}"
+        line += (
+            f"  {spent:5.1f} ms of CPU per record  error {quantiles(far[solved & (exact.status == Status.COMPLETED)])}"
+        )
     print(line)
     return found
 
@@ -137,7 +139,7 @@ def race(solver: Feedback, games: Games) -> None:
         return spent
 
     def ours(iterate: Callable[..., tuple[Tensor, Tensor]]) -> Tensor:
-        return iterate(game, start, solver.iterations, solver.tolerance)[1].flatten() == Status.SOLVED
+        return iterate(game, start, solver.iterations, solver.tolerance)[1].flatten() == Status.COMPLETED
 
     peer = line("iteration by the generator", lambda: generated(games, start))
     for title, module in (("compiled iteration", kernel), ("iteration in PyTorch", iteration)):
@@ -171,7 +173,7 @@ def compare(solver: Feedback, games: Games) -> None:
     with mock.patch.object(iteration, "Anderson", Plain):
         solve("without acceleration", plain, games, exact)
         solve("without, twice as many", dataclasses.replace(plain, iterations=2 * solver.iterations), games, exact)
-    usable = (exact.status == Status.SOLVED).all(1)
+    usable = (exact.status == Status.COMPLETED).all(1)
     wanted = gradient(exactly, games, usable)
     for steps in STEPS:
         found = gradient(dataclasses.replace(exactly, terms=steps), games, usable)

@@ -73,7 +73,7 @@ class GameParameters(Batch):
 class Status(IntEnum):
     """Outcome of the minimisation of one scene and mode."""
 
-    SOLVED = 0
+    COMPLETED = 0
     """All steps were taken, with the configured damping and step size. It does not mean that the solver has converged."""
     DAMPED = 1
     """A factorisation succeeded only with more damping, or steps were shortened; or the LQ games of ``solver=feedback`` have

@@ -145,7 +145,7 @@ class BackendSuite:
         expected = reference(energy, scene, theirs, steps, 0.3, per_sample)
         expected = [torch.where(present, iterate, 0.0) for iterate in expected]
         states = energy.dynamics.rollout(energy.current_states(scene), expected[-1], scene.dt)
-        assert (solution.status == Status.SOLVED).all()
+        assert (solution.status == Status.COMPLETED).all()
         for mine, iterate in zip(solution.iterates, expected, strict=True):
             torch.testing.assert_close(mine, iterate, rtol=0, atol=1e-9)
         real = present.expand_as(states)
@@ -299,7 +299,7 @@ class BackendSuite:
         assert not followed.all()
         lane = torch.where(followed, parameters.own_weights["lane"], 0.0)
         without = dataclasses.replace(parameters, own_weights={**parameters.own_weights, "lane": lane})
-        assert (solution.status == Status.SOLVED).all()
+        assert (solution.status == Status.COMPLETED).all()
         torch.testing.assert_close(solution.controls, self.damped(energy, scene, without).controls, rtol=0, atol=1e-12)
         solution.controls.square().sum().backward()
         assert (leaves.own_weights["lane"].grad[~followed] == 0).all()
@@ -313,7 +313,7 @@ class BackendSuite:
         parameters.initial_controls[0, :, 1] = parameters.initial_controls[0, :, 0]
         leaves = leaves_of(parameters)
         solution = self.damped(FeatureEnergy(ALL, bounds=BOUNDS), dataclasses.replace(scene, history=history), leaves)
-        assert (solution.status == Status.SOLVED).all()
+        assert (solution.status == Status.COMPLETED).all()
         solution.states.sum().backward()
         assert all(gradient.isfinite().all() for gradient in gradients(leaves).values())
 
@@ -359,7 +359,7 @@ class BackendSuite:
         single = self.damped(FeatureEnergy(own), scene, parameters, steps=1)
         exact = self.damped(FeatureEnergy(own), scene.to(torch.float64), parameters.to(torch.float64), steps=1)
         torch.testing.assert_close(single.controls.double(), exact.controls, rtol=0, atol=5e-5)
-        assert (single.status == Status.SOLVED).all()
+        assert (single.status == Status.COMPLETED).all()
 
     def test_small_steps_are_accurate_far_from_the_origin(self):
         scene, own = random_scene(4, 2, history=2, size=0.01), ("acc", "turnr")

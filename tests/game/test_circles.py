@@ -206,7 +206,7 @@ def test_gradients_of_the_layer_equal_finite_differences(mode):
     leaves = leaves_of(parameters)
     backward = Unrolled() if mode == "unrolled" else Implicit()
     solution = backward(solve, energy, scene, leaves)
-    solved = solution.status == Status.SOLVED
+    solved = solution.status == Status.COMPLETED
     cotangent = torch.randn_like(solution.controls)
     if mode == "unrolled":
         assert solved.all()
@@ -312,7 +312,7 @@ def test_samples_depend_on_neither_batch_nor_padding_to_the_last_bit():
         leaves = leaves_of(parameters)
         damping = torch.full(leaves.initial_controls.shape[:2], 10.0)
         solution = structured.solve(energy, scene, leaves, 2, 0.3, damping)
-        assert (solution.status == Status.SOLVED).all()
+        assert (solution.status == Status.COMPLETED).all()
         solution.states[:, :, :4].square().sum().backward()
         by = [leaves.initial_controls.grad, leaves.goals.grad, *(leaves.own_weights[name].grad for name in OWN)]
         weight = leaves.pair_weights["circles"].grad
@@ -338,7 +338,7 @@ def test_sizes_that_are_missing_or_no_numbers_are_noticed():
     scene.size[1, 2, 1] = torch.nan
     assert solve(energy, scene, parameters).status.tolist() == [[0, 0], [Status.STOPPED] * 2, [0, 0]]
     scene.agent_mask[1, 2] = False
-    assert (solve(energy, scene, parameters).status == Status.SOLVED).all()
+    assert (solve(energy, scene, parameters).status == Status.COMPLETED).all()
 
 
 def test_both_backends_solve_rows_of_circles():

@@ -50,7 +50,7 @@ def test_documented_features_work_in_the_layer(documented):
     parameters.pair_weights["comfort"] = parameters.pair_weights["proximity"]
     leaves = leaves_of(parameters)
     solution = LevenbergMarquardt()(FeatureEnergy(own, ["proximity", "comfort"]), scene, leaves)
-    assert (solution.status == Status.SOLVED).all()
+    assert (solution.status == Status.COMPLETED).all()
     assert (solution.energy < solution.initial_energy).all()
     solution.states.sum().backward()
     for name in documented:

@@ -20,7 +20,7 @@ from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarq
 
 OWN = ("acc", "turnr")
 ENERGY = FeatureEnergy(OWN, [])
-SOLVED, DAMPED, STOPPED = int(Status.SOLVED), int(Status.DAMPED), int(Status.STOPPED)
+COMPLETED, DAMPED, STOPPED = int(Status.COMPLETED), int(Status.DAMPED), int(Status.STOPPED)
 
 
 class Given(Stepwise):
@@ -47,11 +47,11 @@ def resting_game() -> tuple[Scene, GameParameters]:
 @pytest.mark.parametrize(
     ("first", "last", "expected"),
     [
-        (SOLVED, SOLVED, SOLVED),
-        (DAMPED, SOLVED, DAMPED),
-        (STOPPED, SOLVED, DAMPED),
-        (SOLVED, DAMPED, DAMPED),
-        (SOLVED, STOPPED, STOPPED),
+        (COMPLETED, COMPLETED, COMPLETED),
+        (DAMPED, COMPLETED, DAMPED),
+        (STOPPED, COMPLETED, DAMPED),
+        (COMPLETED, DAMPED, DAMPED),
+        (COMPLETED, STOPPED, STOPPED),
         (STOPPED, STOPPED, STOPPED),
     ],
 )
@@ -60,7 +60,7 @@ def test_the_status_of_truncated_steps_is_that_of_all_steps(first: int, last: in
     assert (solution.status == expected).all()
 
 
-@pytest.mark.parametrize("status", [SOLVED, DAMPED, STOPPED])
+@pytest.mark.parametrize("status", [COMPLETED, DAMPED, STOPPED])
 def test_an_implicit_derivative_keeps_the_status_of_the_minimiser(status: int) -> None:
     scene, parameters = resting_game()
     solution = Implicit()(Given(status), ENERGY, scene, leaves_of(parameters))

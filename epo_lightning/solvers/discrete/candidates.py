@@ -107,7 +107,7 @@ class Candidates(Minimiser):
             initial_energy=assignments.energies(unary, pair, alone).expand_as(found),
             energy=found,
             gradient_norm=torch.full_like(found, torch.nan),
-            status=torch.where(solved, Status.SOLVED, Status.STOPPED)[:, None].expand(found.shape),
+            status=torch.where(solved, Status.COMPLETED, Status.STOPPED)[:, None].expand(found.shape),
             tables=Tables(
                 states=states,
                 unary=unary,

@@ -99,8 +99,8 @@ def iterate(
     """Iterate LQ games until their policies want to change no state by ``tolerance`` or more, and take this last step.
 
     Returns:
-        the controls, and a status: SOLVED where the iteration has ended, DAMPED where it has not, STOPPED where an LQ game
-        has no unique equilibrium or the next trajectory is not finite; such a game keeps its last trajectory.
+        the controls, and a status: COMPLETED where the iteration has ended, DAMPED where it has not, STOPPED where an LQ
+        game has no unique equilibrium or the next trajectory is not finite; such a game keeps its last trajectory.
     """
     batch, modes = controls.shape[:2]
     game, controls = game.one_by_one(modes), controls.flatten(0, 1)[:, None].clone()
@@ -115,7 +115,7 @@ def iterate(
             break
         some = game[going]
         step = _step(some, states[going], controls[going], length[going])
-        status[going[step.wanted < tolerance]] = int(Status.SOLVED)
+        status[going[step.wanted < tolerance]] = int(Status.COMPLETED)
         status[going[~step.usable]] = int(Status.STOPPED)
         # Policies that answer each other may oscillate: acceleration begins anew, and steps without it are shorter.
         slower = going[~(step.wanted < before[going])]

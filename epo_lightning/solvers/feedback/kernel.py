@@ -75,7 +75,7 @@ class _Attach(torch.autograd.Function):
     def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
         solved, controls = ctx.saved_tensors[:2]
         cotangent, controls = cotangent.contiguous(), controls.contiguous()
-        status = torch.where(solved, int(Status.SOLVED), int(Status.STOPPED)).contiguous()
+        status = torch.where(solved, int(Status.COMPLETED), int(Status.STOPPED)).contiguous()
         gradients, found = ctx.arrays.new_gradients()
         gradients.controls = cotangent.data_ptr()
         run = _arguments(ctx.game, controls, status, terms=ctx.terms)

@@ -86,7 +86,7 @@ class ToFeedback(Minimiser):
         if not exact:
             raise ConfigError("backward.hessian=gauss_newton has no effect with solver=feedback: leave it out")
         assert isinstance(energy, FeatureEnergy)
-        solved = _on_host(solution.status == Status.SOLVED)
+        solved = _on_host(solution.status == Status.COMPLETED)
         if solved.numel() > 2 * solved.sum():
             warnings.warn(
                 "solver=feedback: more than half of the games of a batch are not solved and have no gradient: raise "

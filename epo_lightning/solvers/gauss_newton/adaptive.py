@@ -112,7 +112,7 @@ def _accepted(better: Bool[Tensor, "B M"], trial: Solution, before: Solution) ->
     """The trial solution where it is better, and the solution before it elsewhere."""
     keep = wide(better)
     # If the matrix of a step cannot be factorised, the step counts as rejected.
-    status = before.status.maximum(torch.where(better, trial.status, Status.SOLVED))
+    status = before.status.maximum(torch.where(better, trial.status, Status.COMPLETED))
     return dataclasses.replace(
         before,
         controls=torch.where(keep, trial.controls, before.controls),

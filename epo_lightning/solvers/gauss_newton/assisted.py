@@ -74,7 +74,7 @@ def solve(
     """
     game = _Game.of(energy, scene, parameters, step_size, damping, exact, threads)
     controls = torch.where(scene.agent_mask[:, None, :, None, None], parameters.initial_controls, 0.0)
-    status = torch.where(game.finite_inputs, Status.SOLVED, Status.STOPPED)
+    status = torch.where(game.finite_inputs, Status.COMPLETED, Status.STOPPED)
     iterates, initial_energy = [controls], None
     for _ in range(steps):
         call = game.call(controls, 1)

@@ -63,7 +63,7 @@ class AugmentedLagrangian(Minimiser):
     """Rounds of the layer and of updates of multipliers; solutions are constants, so learn with ``backward=implicit``.
 
     A constraint holds for the agents and pairs whose weight of its feature is not zero; its value has no effect on the
-    strategies. A sample is SOLVED if its constraints are met to the tolerance at a minimum of the augmented Lagrangian.
+    strategies. A sample is COMPLETED if its constraints are met to the tolerance at a minimum of the augmented Lagrangian.
     Others are STOPPED at the end: their constraints may be impossible to meet, such as those of agents that overlap from the
     beginning, or the rounds were too few. ``Solution.constraints`` says how much is missing.
 
@@ -182,7 +182,7 @@ class AugmentedLagrangian(Minimiser):
             initial_energy=initial,
             energy=energy(scene, game.parameters, controls),
             gradient_norm=rounds.norm,
-            status=torch.where(rounds.solved, int(Status.SOLVED), int(Status.STOPPED)),
+            status=torch.where(rounds.solved, int(Status.COMPLETED), int(Status.STOPPED)),
             constraints=Constraints(rounds.multipliers, rounds.penalty, violation, rounds.count),
         )
 
@@ -240,7 +240,7 @@ class AugmentedLagrangian(Minimiser):
             pushed = torch.linalg.lu_solve(lower_upper, pivots.pivots, jacobian @ free + moved) if most else moved
             step = (free - solved @ pushed)[..., 0].view_as(controls)
             attached = solution.controls.detach() + torch.where(descent.wide(definite), step, 0.0).to(solution.controls)
-        return attached, torch.where(definite, int(Status.SOLVED), int(Status.STOPPED))
+        return attached, torch.where(definite, int(Status.COMPLETED), int(Status.STOPPED))
 
 
 @dataclass

@@ -110,7 +110,7 @@ class BestResponse(Minimiser):
         return dataclasses.replace(
             last,
             initial_energy=value,
-            status=torch.where(usable, int(Status.SOLVED), int(Status.STOPPED)),
+            status=torch.where(usable, int(Status.COMPLETED), int(Status.STOPPED)),
         )
 
 

@@ -302,7 +302,7 @@ class _Minimum(torch.autograd.Function):
 
 def _definite(call: Call) -> Tensor:
     """STOPPED for problems whose matrix was not positive definite without damping."""
-    return torch.where(call.status == Status.SOLVED, Status.SOLVED, Status.STOPPED)
+    return torch.where(call.status == Status.COMPLETED, Status.COMPLETED, Status.STOPPED)
 
 
 def prepare_minimum(call: Call, after: Float[Tensor, "B M"]) -> Int[Tensor, "B M"]:

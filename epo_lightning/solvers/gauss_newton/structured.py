@@ -81,7 +81,7 @@ def solve(
     split = readable(controls) if split is None else split
     game = Game(energy, scene, parameters, step_size, damping.detach().to(controls.dtype).flatten(0, 1), split, exact)
     tensors = game.tensors()
-    status = torch.where(game.finite_inputs, Status.SOLVED, Status.STOPPED)
+    status = torch.where(game.finite_inputs, Status.COMPLETED, Status.STOPPED)
     iterates = [controls]
     initial_energy = None
     for _ in range(steps):
@@ -260,7 +260,7 @@ def factorise(
     status = torch.zeros(model.at.problems, dtype=torch.long, device=damping.device)
     for group in groups:
         found, failed = blocks.factorise(model, damping, group)
-        outcome = torch.where(failed, Status.STOPPED, Status.SOLVED)
+        outcome = torch.where(failed, Status.STOPPED, Status.COMPLETED)
         if (split if retry is None else retry) and failed.any():
             _retry(model, damping, group, found, outcome)
         factors.append(found)

@@ -156,7 +156,7 @@ def attach(
         descent.warn_if_far(value, 0.5 * (flat * step).sum(-1), definite)
         move = torch.cholesky_solve((slope - slope.detach()).flatten(2)[..., None], factor).view_as(controls)
         attached = controls - torch.where(descent.wide(definite), move, 0.0)
-        return attached, torch.where(definite, Status.SOLVED, Status.STOPPED).long()
+        return attached, torch.where(definite, Status.COMPLETED, Status.STOPPED).long()
 
 
 def factorise(matrix: Float[Tensor, "*batch n n"]) -> tuple[Float[Tensor, "*batch n n"], Bool[Tensor, "*batch"]]:

@@ -106,8 +106,8 @@ def solution(
 
 
 def first_status(is_finite: Bool[Tensor, "B M"]) -> Tensor:
-    """The initial status: SOLVED, or STOPPED where energy or gradient are not finite at the start."""
-    return torch.where(is_finite, int(Status.SOLVED), int(Status.STOPPED))
+    """The initial status: COMPLETED, or STOPPED where energy or gradient are not finite at the start."""
+    return torch.where(is_finite, int(Status.COMPLETED), int(Status.STOPPED))
 
 
 def warn_if_far(

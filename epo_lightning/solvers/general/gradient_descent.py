@@ -157,7 +157,7 @@ def descend(
         energies, length = torch.where(good, value, energies), torch.where(good, length, 0.5 * length)
         lowest = torch.minimum(lowest, energies)
         taken = taken | good
-    shortened = torch.where(length < 1.0, Status.DAMPED, Status.SOLVED)
+    shortened = torch.where(length < 1.0, Status.DAMPED, Status.COMPLETED)
     status = torch.where(finite & (taken | (steps == 0)), shortened, Status.STOPPED)
     solution = descent.solution(energy, scene, controls, (initial_energy, energies), slope.detach(), status)
     return solution, Progress(length, lowest, taken)

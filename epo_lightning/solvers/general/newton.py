@@ -98,7 +98,7 @@ class Newton(Minimiser):
             near = whole & (damping <= _FIRST_DAMPING) & (descent.largest(move) <= self.tolerance)
             exhausted = definite & (length * promised <= descent.rounding(value))
             stuck = open_ & ~better & (exhausted | (damping >= _MOST_DAMPING))
-            status = torch.where(open_ & ~definite & (status == Status.SOLVED), int(Status.DAMPED), status)
+            status = torch.where(open_ & ~definite & (status == Status.COMPLETED), int(Status.DAMPED), status)
             # The secant rule: the point where the directional derivative vanishes if it is linear along the step.
             share = promised / (promised + (trial[1] * move).flatten(2).sum(-1))
             shorter = length * share.nan_to_num(0.0).clamp(0.1, 0.5)

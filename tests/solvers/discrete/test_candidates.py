@@ -94,7 +94,7 @@ def test_modes_are_the_best_joint_strategies(kind):
         solution.states, ENERGY.dynamics.rollout(ENERGY.current_states(scene), solution.controls, 0.1)
     )
     assert (solution.initial_energy >= solution.energy[:, :1]).all()
-    assert (solution.status == Status.SOLVED).all()
+    assert (solution.status == Status.COMPLETED).all()
     assert solution.gradient_norm.isnan().all()
     tables = solution.tables
     assert tables is not None
@@ -193,7 +193,7 @@ def test_scenes_without_an_answer_stop_and_leave_the_others_alone(kind, broken):
     assert torch.equal(solution.controls[1], game.initial_controls[1, 0].expand(2, 3, 5, 2))
     assert solution.tables.log_partition[1].isnan()
     others = [0, 2]
-    assert (solution.status[others] == Status.SOLVED).all()
+    assert (solution.status[others] == Status.COMPLETED).all()
     torch.testing.assert_close(solution.controls[others], whole.controls[others])
     torch.testing.assert_close(solution.energy[others], whole.energy[others])
     torch.testing.assert_close(solution.tables.log_marginals[others], whole.tables.log_marginals[others])

@@ -68,7 +68,7 @@ def test_solutions_are_those_of_the_generator_of_rpi() -> None:
         ours = true_game(torch.tensor([game.weight]), goals[..., :2], goals[..., 2], steps)
         ours = dataclasses.replace(ours, initial_controls=torch.from_numpy(u).view(1, 1, steps, 2, 2).transpose(2, 3))
         found = Feedback(**EXACT).descent().near_minimum()(TRUE_ENERGY, scene, ours)
-        assert found.status.item() == Status.SOLVED
+        assert found.status.item() == Status.COMPLETED
         wanted = torch.from_numpy(x[1:]).view(steps, 2, 4).transpose(0, 1)
         torch.testing.assert_close(found.states[0, 0], wanted, rtol=0, atol=1e-7)
 
@@ -80,7 +80,7 @@ def test_the_modes_are_on_different_sides_and_not_those_of_the_open_loop_game() 
     turn = torch.atan2(sight[..., 1], sight[..., 0]).diff(dim=-1)
     side = ((turn + math.pi) % (2 * math.pi) - math.pi).sum(-1).sign()
     assert (side[:, 0] == -side[:, 1]).all()
-    assert (found.status == Status.SOLVED).all()
+    assert (found.status == Status.COMPLETED).all()
     assert (found.gradient_norm > 1.0).all(), "an open-loop equilibrium has no gradient"
     torch.testing.assert_close(found.energy, ENERGY(scene, game, found.controls))
 
@@ -127,7 +127,7 @@ def test_acceleration_reaches_the_same_equilibria_in_fewer_games(monkeypatch: py
         counted.append(0)
         monkeypatch.setattr(iteration, "Anderson", memory)
         found = Feedback(**EXACT, backend="pytorch")(ENERGY, scene, game)
-        assert (found.status == Status.SOLVED).all()
+        assert (found.status == Status.COMPLETED).all()
         return found.states
 
     def equilibrium(local: LQGame) -> Policy:
@@ -297,5 +297,5 @@ def test_an_energy_of_pairs_alone_can_be_solved() -> None:
     scene, game = meeting(2.3)
     pairs = dataclasses.replace(ENERGY, own=[])
     found = Feedback()(pairs, scene, dataclasses.replace(game, own_weights={}))
-    assert (found.status == Status.SOLVED).all()
+    assert (found.status == Status.COMPLETED).all()
     assert found.states.isfinite().all()

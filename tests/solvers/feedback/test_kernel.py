@@ -160,9 +160,9 @@ def test_scenes_without_agents_are_solved() -> None:
     game = random_feedback_game(scenes=3)
     game.scene.agent_mask[0] = False
     controls, status = kernel.iterate(game, controls_of(game), 3, 1e-12)
-    assert (status[0] == Status.SOLVED).all()
+    assert (status[0] == Status.COMPLETED).all()
     assert not controls[0].any()
-    assert (status[1:] != Status.SOLVED).any()
+    assert (status[1:] != Status.COMPLETED).any()
 
 
 @pytest.mark.parametrize("value", [torch.nan, torch.inf])

@@ -147,7 +147,7 @@ def test_features_that_couple_states_and_controls_equal_the_reference(
     solution = assisted.solve(energy, scene, ours, steps, 0.5, damping, keep_iterates=True)
     present = scene.agent_mask[:, None, :, None, None]
     expected = [torch.where(present, u, 0.0) for u in reference(energy, scene, theirs, steps, 0.5, damping)]
-    assert (solution.status == Status.SOLVED).all()
+    assert (solution.status == Status.COMPLETED).all()
     for mine, iterate in zip(solution.iterates, expected, strict=True):
         torch.testing.assert_close(mine, iterate, rtol=0, atol=1e-9)
     torch.testing.assert_close(solution.initial_energy, energy(scene, parameters, expected[0]))
@@ -202,7 +202,7 @@ def test_newton_steps_equal_those_of_a_dense_hessian(agents, pair, own, stride, 
     damping = torch.full((2, 2), 300.0, dtype=torch.float64)
     found = assisted.solve(energy, scene, parameters, 1, 0.7, damping, exact=True)
     expected, definite = newton_step(energy, scene, parameters, 300.0)
-    assert torch.equal(found.status, torch.where(definite, Status.SOLVED, Status.DAMPED))
+    assert torch.equal(found.status, torch.where(definite, Status.COMPLETED, Status.DAMPED))
     again, enough = newton_step(energy, scene, parameters, 300.0 + 10 * 300.0)  # the second attempt
     assert enough.all()
     expected = torch.where(definite[..., None, None, None], expected, again)
@@ -342,7 +342,7 @@ def test_an_input_that_the_function_hides_stops_its_game(steps, exact):
     parameters.margins["room"][1, 0] = -torch.inf  # no residual is left
     leaves = leaves_of(parameters)
     found = assisted.solve(energy, scene, leaves, steps, 0.3, torch.full((3, 2), 100.0), exact=exact)
-    assert found.status.tolist() == [[Status.SOLVED] * 2, [Status.STOPPED, Status.SOLVED], [Status.SOLVED] * 2]
+    assert found.status.tolist() == [[Status.COMPLETED] * 2, [Status.STOPPED, Status.COMPLETED], [Status.COMPLETED] * 2]
     assert torch.equal(found.controls[1, 0], parameters.initial_controls[1, 0])
     if steps and not exact:
         found.controls.sum().backward()

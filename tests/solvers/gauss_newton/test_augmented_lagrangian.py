@@ -72,7 +72,7 @@ def test_the_solution_is_the_one_of_scipy(agents):
     """SLSQP on the same objective and constraints, with gradients by automatic differentiation, from the same start."""
     scene, parameters = meeting(agents)
     found = EXACT(ENERGY, scene, parameters)
-    assert (found.status == Status.SOLVED).all()
+    assert (found.status == Status.COMPLETED).all()
     game, shape = ConstrainedGame(ENERGY, EXACT.hard(ENERGY), scene, parameters), parameters.initial_controls.shape
 
     def objective(flat):
@@ -240,7 +240,7 @@ def test_agents_that_overlap_from_the_beginning_are_stopped_and_disturb_no_other
     doubled = parameters.map(lambda tensor: torch.cat((tensor, tensor)).requires_grad_())
     solve = AugmentedLagrangian(rounds=15)
     found = Implicit()(solve, ENERGY, both, doubled)
-    assert found.status.flatten().tolist() == [Status.SOLVED, Status.STOPPED]
+    assert found.status.flatten().tolist() == [Status.COMPLETED, Status.STOPPED]
     assert found.constraints.violation[1] > 0.1
     alone = solve(ENERGY, scene, parameters)
     torch.testing.assert_close(found.controls[:1], alone.controls, rtol=0, atol=1e-9)
@@ -260,7 +260,7 @@ def test_absent_agents_and_pairs_without_weight_have_no_constraint():
     poisoned[:, 2] = torch.nan
     absent = AugmentedLagrangian()(ENERGY, dataclasses.replace(scene, history=poisoned, agent_mask=mask), parameters)
     assert absent.controls.isfinite().all()
-    assert (absent.status == Status.SOLVED).all()
+    assert (absent.status == Status.COMPLETED).all()
     assert (absent.constraints.multipliers["proximity"][:, :, 1:] == 0).all()
 
 
@@ -299,7 +299,7 @@ def test_games_that_end_early_have_the_derivative_of_finite_differences():
     parameters = parameters.map(lambda value: value.expand(2, *value.shape[1:]).clone())
     goals = parameters.goals.clone().requires_grad_()
     found = Implicit()(EXACT, ENERGY, scene, dataclasses.replace(parameters, goals=goals))
-    assert (found.status == Status.SOLVED).all()
+    assert (found.status == Status.COMPLETED).all()
     generator = torch.Generator().manual_seed(0)
     cotangent = torch.randn(found.controls.shape, dtype=torch.double, generator=generator)
     (slope,) = torch.autograd.grad((found.controls * cotangent).sum(), goals)

@@ -50,7 +50,7 @@ def test_a_single_minimum_is_the_one_of_the_central_solution(order: str) -> None
     with torch.no_grad():
         expected = CENTRAL(ENERGY, scene, game)
     found = BestResponse(rounds=200, order=order, tolerance=0.0)(ENERGY, scene, game)
-    assert (found.status == Status.SOLVED).all()
+    assert (found.status == Status.COMPLETED).all()
     torch.testing.assert_close(found.energy, expected.energy, rtol=1e-8, atol=0)
     torch.testing.assert_close(found.states, expected.states, rtol=0, atol=1e-4)
 
@@ -150,5 +150,5 @@ def test_a_game_with_a_margin_that_is_no_number_is_stopped_and_disturbs_no_other
     sound = dataclasses.replace(game, margins={"clearance": torch.full_like(margins, 0.5)})
     solve = BestResponse(rounds=5, order=order)
     found, expected = solve(energy, scene, broken), solve(energy, scene, sound)
-    assert found.status.tolist() == [[int(Status.STOPPED), int(Status.SOLVED)]]
+    assert found.status.tolist() == [[int(Status.STOPPED), int(Status.COMPLETED)]]
     torch.testing.assert_close(found.controls[:, 1], expected.controls[:, 1], rtol=0, atol=0)

@@ -51,7 +51,7 @@ def turns(states: torch.Tensor) -> torch.Tensor:
 def test_the_modes_are_minima_on_different_sides() -> None:
     scene, game = meeting(math.pi, 2.5, -2.5, 2.0)
     solution = BothSides(steps=15)(ENERGY, scene, game)
-    assert (solution.status == Status.SOLVED).all()
+    assert (solution.status == Status.COMPLETED).all()
     side = turns(solution.states)
     assert (side[:, 0] == -side[:, 1]).all()
     assert solution.gradient_norm.max() < 1e-6

@@ -306,4 +306,4 @@ def test_a_gpu_gets_the_results_of_the_cpu(monkeypatch):
     expected.states.square().sum().backward()
     exact = gradients(theirs)
     assert all(torch.allclose(gradient.cpu(), exact[name]) for name, gradient in gradients(ours).items())
-    assert (found.status == Status.SOLVED).all()
+    assert (found.status == Status.COMPLETED).all()

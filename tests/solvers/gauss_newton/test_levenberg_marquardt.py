@@ -187,7 +187,7 @@ def test_implicit_gradients_equal_central_differences_of_the_minimum(own):
     solution = Implicit()(solve, energy, scene, leaves)
     assert solution.gradient_norm.max() < 1e-9
     assert (energy.residuals(scene, parameters, solution.controls.detach())["proximity"] != 0).any()
-    assert (solution.status == Status.SOLVED).all()
+    assert (solution.status == Status.COMPLETED).all()
     cotangent = torch.randn_like(parameters.initial_controls)
     (solution.controls * cotangent).sum().backward()
     assert leaves.initial_controls.grad is None

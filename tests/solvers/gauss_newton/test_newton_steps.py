@@ -58,7 +58,7 @@ def test_a_newton_step_is_the_same_in_both_backends(seed, agents, own, pair, end
     ]
     # A matrix that is not positive definite is damped more, for all agents that are factorised together. For pair features
     # of states, the two backends find other sets of these agents.
-    solved = [one.status == Status.SOLVED for one in found]
+    solved = [one.status == Status.COMPLETED for one in found]
     same = solved[0] & solved[1] if set(pair) - set(PAIR) else torch.ones(3, 2, dtype=torch.bool)
     torch.testing.assert_close(found[1].controls[same], found[0].controls[same], rtol=1e-6, atol=1e-8)
     assert torch.equal(found[1].status[same], found[0].status[same])
@@ -127,7 +127,7 @@ def test_steps_without_held_agents_in_the_factorisation_equal_those_with_infinit
         other, damping_other = solver.run(energy, scene, game, 1, memory, exact=exact)
     # A matrix that is not positive definite is damped more, for all agents that are factorised together. Without the held
     # agents, these are fewer.
-    same = (one.status == Status.SOLVED) & (other.status == Status.SOLVED)
+    same = (one.status == Status.COMPLETED) & (other.status == Status.COMPLETED)
     assert same.any() or exact
     assert torch.equal(other.controls[held], game.initial_controls[held])
     torch.testing.assert_close(other.controls[same], one.controls[same], rtol=1e-8, atol=1e-10)
@@ -226,7 +226,7 @@ def test_games_whose_energy_is_infinite_are_stopped(backend) -> None:
     game.goals[1, 0, 2] = 1e200
     with torch.no_grad():
         found = LevenbergMarquardt(4, backend=backend, **ADAPTIVE)(energy, scene, game)
-    assert found.status.tolist() == [[Status.SOLVED] * 2, [Status.STOPPED, Status.SOLVED], [Status.SOLVED] * 2]
+    assert found.status.tolist() == [[Status.COMPLETED] * 2, [Status.STOPPED, Status.COMPLETED], [Status.COMPLETED] * 2]
     assert torch.equal(found.controls[1, 0], game.initial_controls[1, 0])
 
 

@@ -29,7 +29,7 @@ def test_vehicles_on_one_line_pass_beside_each_other_only_after_a_small_turn(fea
     solve = LevenbergMarquardt(steps=200, step_size=1.0, damping=1.0, adaptive=True)
     solution = solve(FeatureEnergy(own=["velref", "acc", "turnr"], pair=[feature]), scene, parameters)
     first, second = solution.states[0, 0, :, :, :2]
-    assert solution.status.item() == Status.SOLVED  # also where they have driven through each other
+    assert solution.status.item() == Status.COMPLETED  # also where they have driven through each other
     through = (first - second).norm(dim=-1).min() < 2.5
     aside = solution.states[0, 0, :, :, 1].abs().max()
     if turn:

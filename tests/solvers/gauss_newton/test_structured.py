@@ -197,7 +197,7 @@ def test_a_sample_without_a_factorisation_stops_alone():
         weight[1] = 0.0
     leaves = leaves_of(parameters)
     solution = solve(energy, scene, leaves, damping=0.0, split=False)
-    assert solution.status[:, 0].tolist() == [Status.SOLVED, Status.STOPPED, Status.SOLVED]
+    assert solution.status[:, 0].tolist() == [Status.COMPLETED, Status.STOPPED, Status.COMPLETED]
     torch.testing.assert_close(solution.controls[[0, 2]], sound.controls[[0, 2]], rtol=0, atol=1e-5)
     assert torch.equal(solution.controls[1], parameters.initial_controls[1])
     solution.controls.sum().backward()
@@ -272,7 +272,7 @@ def test_undeclared_features_have_the_implicit_gradients_of_declared_ones(twins)
         leaves = leaves_of(game)
         solution = minimise(FeatureEnergy(own, [name]), scene, leaves)
         assert solution.gradient_norm.max() < 1e-8
-        assert (solution.status == Status.SOLVED).all()
+        assert (solution.status == Status.COMPLETED).all()
         solution.states.sum().backward()
         by_own = [leaves.own_weights[one].grad for one in own]
         return solution.controls.detach(), [sum(by_own[:-1]), by_own[-1], leaves.pair_weights[name].grad]

@@ -28,7 +28,7 @@ def solved(energy, scene, game, exact=True):
     assert solution.gradient_norm.max() < 1e-9
     controls, status = attach(energy, scene, game, solution.controls, exact)
     assert torch.equal(controls.detach(), solution.controls)
-    assert (status == Status.SOLVED).all()
+    assert (status == Status.COMPLETED).all()
     return controls
 
 
@@ -160,7 +160,7 @@ def test_points_that_are_no_minimum_have_zero_gradients():
     ):
         assert slope.isfinite().all()
         assert (slope[expected == Status.STOPPED] == 0).all()
-        assert (slope[expected == Status.SOLVED] != 0).any()
+        assert (slope[expected == Status.COMPLETED] != 0).any()
 
 
 def test_a_nan_scene_gives_networks_no_gradient():
@@ -180,7 +180,7 @@ def test_a_nan_scene_gives_networks_no_gradient():
     context[0] = torch.nan
     status, found = slopes(dataclasses.replace(scene, history=history), dataclasses.replace(game, context=context))
     assert (status[0] == Status.STOPPED).all()
-    assert (status[1] == Status.SOLVED).all()
+    assert (status[1] == Status.COMPLETED).all()
     for one, other in zip(found, expected, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-12)
 

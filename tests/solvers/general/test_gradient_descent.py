@@ -66,7 +66,7 @@ def test_steps_on_a_quadratic_energy_are_powers():
     assert_close(solution.energy, 0.5 * (stiffness * expected.square()).sum((2, 3, 4)))
     assert_close(solution.gradient_norm, (stiffness * expected).flatten(2).norm(dim=-1))
     assert_close(solution.states, QUADRATIC.dynamics.rollout(scene.current[:, None], expected, scene.dt))
-    assert (solution.status == Status.SOLVED).all()
+    assert (solution.status == Status.COMPLETED).all()
 
 
 def test_steps_contract_up_to_the_bound_and_are_shortened_beyond_it():
@@ -74,7 +74,7 @@ def test_steps_contract_up_to_the_bound_and_are_shortened_beyond_it():
     parameters.own_weights["acc"].fill_(2.0)
     parameters.own_weights["turnr"].fill_(20.0)
     bound = 2.0 / max(2.0**2, 20.0**2 * 0.1**2)  # 2 / lambda_max(S H S)
-    for share, status in ((0.99, Status.SOLVED), (1.01, Status.DAMPED), (50.0, Status.DAMPED)):
+    for share, status in ((0.99, Status.COMPLETED), (1.01, Status.DAMPED), (50.0, Status.DAMPED)):
         solution = GradientDescent(60, share * bound, [1.0, 0.1])(QUADRATIC, scene, parameters)
         assert (solution.energy < 0.2 * solution.initial_energy).all()
         assert (solution.status == status).all()
@@ -138,7 +138,7 @@ def test_the_status_covers_all_steps(first):
     scene, parameters = quadratic(scenes=1, modes=1, agents=1)
     for name in QUADRATIC.own:
         parameters.own_weights[name].fill_(1.0)
-    for steps, size, status in ((8, 9.0, Status.DAMPED), (8, 1e9, Status.STOPPED), (8, 1.0, Status.SOLVED)):
+    for steps, size, status in ((8, 9.0, Status.DAMPED), (8, 1e9, Status.STOPPED), (8, 1.0, Status.COMPLETED)):
         whole = GradientDescent(steps, size)(QUADRATIC, scene, parameters)
         parts = Truncated(steps - first)(GradientDescent(steps, size), QUADRATIC, scene, parameters)
         assert whole.status.item() == parts.status.item() == status

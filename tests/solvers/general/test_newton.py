@@ -138,7 +138,7 @@ def test_the_papers_energy_has_the_minimum_that_levenberg_marquardt_finds(minimi
     solution = minimise(FEATURES, scene, game)
     assert (solution.controls - peer.controls).abs().max() < 1e-7
     torch.testing.assert_close(solution.energy, peer.energy, rtol=1e-8, atol=0)
-    assert (solution.status == Status.SOLVED).all()
+    assert (solution.status == Status.COMPLETED).all()
     assert solution.gradient_norm.max() < 1e-7
 
 
@@ -168,7 +168,7 @@ def test_newton_converges_across_hinges_from_any_start(direction):
     energy = convex_energy(direction=direction, gap=2.0, within=20.0)
     exact = PRECISE[0](energy, scene, game)
     assert exact.gradient_norm.max() < 1e-8
-    assert (exact.status == Status.SOLVED).all()
+    assert (exact.status == Status.COMPLETED).all()
     energies = [Newton(steps, 1e-8)(energy, scene, game).energy for steps in (0, 1, 2, 3, 5, 8, 12, 40)]
     for before, after in itertools.pairwise(energies):
         assert (after <= before * (1 + 1e-14)).all()
@@ -247,7 +247,7 @@ def test_absent_agents_do_not_change_solutions(minimise):
     solution = minimise(convex_energy(), pad(scene, 2), widen_convex(game, 2))
     assert (solution.controls[:, :, :2] - expected.controls).abs().max() < 1e-9
     assert (solution.controls[:, :, 2:] == 0).all()
-    assert (solution.status == Status.SOLVED).all()
+    assert (solution.status == Status.COMPLETED).all()
     assert solution.gradient_norm.isfinite().all()
 
 

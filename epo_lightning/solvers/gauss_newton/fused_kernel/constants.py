@@ -15,7 +15,7 @@ JERK, TURNACC = OWN.index("jerk"), OWN.index("turnacc")
 JERKB, TURNACCB = OWN.index("jerkb"), OWN.index("turnaccb")
 BOUND_VEL, BOUND_ACC, BOUND_TURNR, BOUND_JERK, BOUND_TURNACC = range(len(SIGNALS))
 PAIRS = len(PAIR)
-SOLVED, DAMPED, STOPPED = (int(status) for status in (Status.SOLVED, Status.DAMPED, Status.STOPPED))
+COMPLETED, DAMPED, STOPPED = (int(status) for status in (Status.COMPLETED, Status.DAMPED, Status.STOPPED))
 X, Y, TURNED, SPEED, SINE, COSINE = range(6)  # arrays of a trajectory
 NEAR_X, NEAR_Y, AHEAD_X, AHEAD_Y = range(4)  # nearest points of reference lines, and unit tangents there
 # Derivatives by the controls of an agent: gradient by turn rate and acceleration, the part of it by their changes, damped

@@ -20,7 +20,7 @@ from epo_lightning.solvers.gauss_newton.fused_kernel import recursion as recursi
 from epo_lightning.solvers.gauss_newton.fused_kernel import residuals as all_residuals
 from epo_lightning.solvers.gauss_newton.fused_kernel import totals as all_totals
 from epo_lightning.solvers.gauss_newton.fused_kernel import trajectories as all_trajectories
-from epo_lightning.solvers.gauss_newton.fused_kernel.constants import DAMPED, PAIRS, SOLVED, STOPPED, TEAM, WARP
+from epo_lightning.solvers.gauss_newton.fused_kernel.constants import COMPLETED, DAMPED, PAIRS, STOPPED, TEAM, WARP
 from epo_lightning.solvers.gauss_newton.fused_kernel.features import Features
 from epo_lightning.solvers.gauss_newton.kernel.interface import OWN
 from epo_lightning.solvers.gauss_newton.structured import RETRIES
@@ -118,7 +118,7 @@ def make(
             end = end_of(g, game)
             sound = valid(g, game, n, agents)
             copy_weights(g, game, n, agents, costs)
-            status = SOLVED
+            status = COMPLETED
             if sound == 0:
                 status = STOPPED
             initial = part(run.iterates, wp.int64(0), everything)

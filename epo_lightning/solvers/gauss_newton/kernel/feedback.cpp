@@ -85,7 +85,7 @@ class Iteration {
         for (int64_t problem = first_; problem < last_; ++problem) {
             const uint8_t* present = game_.present + problem / game_.M * game_.N;
             const bool empty = std::count(present, present + game_.N, 0) == game_.N;
-            run_.status[problem] = !valid<double>(game_, problem) ? STOPPED : empty ? SOLVED : DAMPED;
+            run_.status[problem] = !valid<double>(game_, problem) ? STOPPED : empty ? COMPLETED : DAMPED;
         }
         for (int64_t number = 0; number < run_.iterations; ++number) {
             const Plan plan = plan_of(game_, first_, last_, [&](int64_t problem) { return run_.status[problem] == DAMPED; });
@@ -150,7 +150,7 @@ class Iteration {
             if (!usable[lane])
                 run_.status[problem] = STOPPED;
             else if (wanted[lane] < run_.tolerance)
-                run_.status[problem] = SOLVED;
+                run_.status[problem] = COMPLETED;
         }
     }
 

@@ -102,7 +102,7 @@ void feedback_pull_back(const EpoGame* game, const EpoFeedback* run, const EpoGr
     Arena<double> arena;
     const Plan plan = plan_of(*game, first, last, [&](int64_t problem) {
         const double* of = cotangent + problem * row;
-        return run->status[problem] == SOLVED && valid<double>(*game, problem) && std::any_of(of, of + row, [](double entry) { return entry != 0; });
+        return run->status[problem] == COMPLETED && valid<double>(*game, problem) && std::any_of(of, of + row, [](double entry) { return entry != 0; });
     });
     for_each_game(*game, arena, plan, run->controls, [&](const Game& g, const auto& size, int filled) {
         Derivative derivative(g, size, run->rho);

@@ -18,9 +18,9 @@ enum Control { ACCELERATION, TURN_RATE };
 /// Signals that can have bounds.
 enum Bounded { BOUND_VEL, BOUND_ACC, BOUND_TURNR, BOUND_JERK, BOUND_TURNACC, BOUND_COUNT };
 
-/// Outcome of a problem. SOLVED: all steps were taken. DAMPED: some steps were possible only with more damping. STOPPED: a step
+/// Outcome of a problem. COMPLETED: all steps were taken. DAMPED: some steps were possible only with more damping. STOPPED: a step
 /// was not possible, and the iterate before it was kept.
-enum Status { SOLVED, DAMPED, STOPPED };
+enum Status { COMPLETED, DAMPED, STOPPED };
 
 /// Entries of a residual that the caller gives: its value, and its derivatives by x, y, heading and speed after a step and by the
 /// acceleration and the turn rate of the step.
@@ -151,7 +151,7 @@ struct EpoFeedback {
     double largest_move, shortest;  // largest change of a state in one iteration; least step length
     double dependent;              // part of a column, relative to its norm, up to which it depends on others
     double* controls;              // [B, M, N, K, 2]; the solution overwrites the initial strategies
-    int64_t* status;               // [B, M]: SOLVED if the iteration has ended, DAMPED if not, STOPPED if it was not possible
+    int64_t* status;               // [B, M]: COMPLETED if the iteration has ended, DAMPED if not, STOPPED if it was not possible
 };
 
 /// Policies of S games of N agents around given trajectories, and the trajectories that follow them.

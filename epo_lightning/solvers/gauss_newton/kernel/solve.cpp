@@ -210,7 +210,7 @@ class Range {
           valid_(last - first), done_(last - first, 0) {
         for (int64_t problem = first; problem < last; ++problem) {
             valid_[problem - first] = valid<T>(game, problem);
-            run.status[problem] = valid_[problem - first] ? SOLVED : STOPPED;
+            run.status[problem] = valid_[problem - first] ? COMPLETED : STOPPED;
         }
         for (int64_t problem = first; problem < last; ++problem)
             for (int64_t i = 0; i < game.N; ++i) {
@@ -367,7 +367,7 @@ class Range {
         else
             measure(controls, best.data() - first_, nullptr, held_);
         for (int64_t s = 0; s < run_.steps; ++s) {
-            for (int64_t at = 0; at < count; ++at) tried[at] = valid_[at] ? SOLVED : STOPPED;
+            for (int64_t at = 0; at < count; ++at) tried[at] = valid_[at] ? COMPLETED : STOPPED;
             step(controls, trial, static_cast<T*>(run_.directions), nullptr, predicted.data() - first_, tried.data() - first_);
             measure(trial, found.data() - first_, nullptr, held_);
             bool all = true;
