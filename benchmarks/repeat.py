@@ -20,11 +20,12 @@ from benchmarks.command_line import parser_of
 from epo_lightning.experiment.assembly import build_data
 from epo_lightning.experiment.config.compose import compose
 from epo_lightning.experiment.train import train
+from epo_lightning.files import read_json
 from epo_lightning.identity import ELSEWHERE
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.curves import METRIC
 from epo_lightning.report.results import SavedRun, read_results, results_name
-from epo_lightning.run_folder import RunFolder, read_json
+from epo_lightning.run_folder import RunFolder
 
 SPLITS = {"metrics.json": "test", "metrics-val.json": "val"}
 """Split by the name of the file of its scores."""

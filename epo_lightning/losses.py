@@ -234,8 +234,8 @@ def _mean_over_agents(values: Tensor, mask: Bool[Tensor, "B N K"]) -> Tensor:
 
 
 def _relaxed(
-    closest: Float[Tensor, "B *agents"], distance: Float[Tensor, "B M *agents"], relaxation: float | Tensor
-) -> Float[Tensor, "B *agents"]:
+    closest: Float[Tensor, " B *agents"], distance: Float[Tensor, "B M *agents"], relaxation: float | Tensor
+) -> Float[Tensor, " B *agents"]:
     """The distance of the closest mode, mixed with a share of the mean over all modes.
 
     Without relaxation, modes at an infinite distance do not count.
@@ -321,8 +321,8 @@ def marginal_probability(
 
 
 def _cross_entropy(
-    log_probabilities: Float[Tensor, "B choices *agents"], chosen: Int[Tensor, "B *agents"]
-) -> Float[Tensor, "B *agents"]:
+    log_probabilities: Float[Tensor, "B choices *agents"], chosen: Int[Tensor, " B *agents"]
+) -> Float[Tensor, " B *agents"]:
     """-log p of the chosen ones.
 
     A mode with p = 0 (a repeated one) costs -log of the smallest positive number, without a gradient.

@@ -31,9 +31,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from epo_lightning.files import write_file
 from epo_lightning.refinement.given import check_forecast
 from epo_lightning.registry import ConfigError, nearest
-from epo_lightning.run_folder import write_file
 from epo_lightning.scene import Scene
 
 REQUIRED = ("states", "probabilities", "history", "dt")

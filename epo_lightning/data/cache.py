@@ -29,6 +29,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from epo_lightning.data.mapped import mapped, not_finite
+from epo_lightning.files import whole_file
 from epo_lightning.registry import ConfigError
 
 FORMAT = 1
@@ -139,15 +140,8 @@ def write_file(path: Path, content: bytes) -> None:
     Raises:
         OSError: the disk is full or read-only; the message names the file.
     """
-    # Processes with the same number may write the same file from several machines.
-    temporary = path.with_name(f".{path.name}.{platform.node()}-{os.getpid()}")
-    with writing(path):
-        try:
-            temporary.write_bytes(content)
-            temporary.replace(path)
-        except BaseException:
-            temporary.unlink(missing_ok=True)
-            raise
+    with writing(path), whole_file(path) as temporary:
+        temporary.write_bytes(content)
 
 
 def write(

@@ -36,8 +36,8 @@ class Motions(nn.Module):
     kappa = tan(delta) / wheelbase; and it has neither the quasi-random sequence nor the bound on lateral acceleration.
 
     Args:
-        horizon: number K of future steps.
         count: number C of candidates.
+        horizon: number K of future steps.
         acceleration: A [m/s^2].
         curvature: kappa_max [1/m].
 
@@ -47,9 +47,9 @@ class Motions(nn.Module):
 
     points: Tensor
 
-    def __init__(self, horizon: int, count: int, acceleration: float, curvature: float) -> None:
+    def __init__(self, count: int, horizon: int, acceleration: float, curvature: float) -> None:
         super().__init__()
-        for name, value in (("horizon", horizon), ("count", count)):
+        for name, value in (("count", count), ("horizon", horizon)):
             if value < 1:
                 raise ValueError(f"{name} must be 1 or more, not {value}")
         for name, limit in (("acceleration", acceleration), ("curvature", curvature)):

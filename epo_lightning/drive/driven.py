@@ -13,8 +13,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from epo_lightning.drive.measures import RATES
+from epo_lightning.files import errors_naming, write_file
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import errors_naming, write_file
 
 REMEDY = "nothing is mixed; choose another out=<folder>, or delete it"
 

@@ -17,10 +17,10 @@ from matplotlib.transforms import Affine2D
 
 from epo_lightning.drive.episodes import Episodes
 from epo_lightning.drive.world import EGO
+from epo_lightning.files import whole_file
 from epo_lightning.metrics.functional.overlap import overlaps_with
 from epo_lightning.report.animation import write_gif
 from epo_lightning.report.style import style
-from epo_lightning.run_folder import whole_file
 from epo_lightning.scene import HEADING
 
 COLUMNS = 3

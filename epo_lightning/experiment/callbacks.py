@@ -19,9 +19,10 @@ from lightning.pytorch import callbacks as of_lightning
 from lightning.pytorch.callbacks import TQDMProgressBar
 
 from epo_lightning.experiment.config.settings import CallbackSettings
+from epo_lightning.files import write_json
 from epo_lightning.forecasters.step_means import StepMeans
 from epo_lightning.registry import ConfigError, nearest
-from epo_lightning.run_folder import RunFolder, write_json
+from epo_lightning.run_folder import RunFolder
 
 
 class RandomStates(Callback):

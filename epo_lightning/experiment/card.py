@@ -10,8 +10,9 @@ from typing import Any
 import torch
 
 from epo_lightning import pretrained
+from epo_lightning.files import read_json
 from epo_lightning.registry import ConfigError, nearest
-from epo_lightning.run_folder import RunFolder, read_json
+from epo_lightning.run_folder import RunFolder
 from epo_lightning.schema import read
 
 SCORES = {

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
 
-from epo_lightning.run_folder import write_file
+from epo_lightning.files import write_file
 
 
 class WholeCheckpoints(TorchCheckpointIO):

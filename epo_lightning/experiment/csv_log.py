@@ -13,7 +13,8 @@ from typing import Any
 from lightning.pytorch.loggers import Logger
 from torch import Tensor
 
-from epo_lightning.run_folder import RunFolder, errors_naming, read_log, write_file
+from epo_lightning.files import errors_naming, write_file
+from epo_lightning.run_folder import RunFolder, read_log
 
 
 class CSVLog(Logger):

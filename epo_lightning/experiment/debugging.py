@@ -21,8 +21,9 @@ from torch.utils.hooks import RemovableHandle
 from torchmetrics import Metric
 
 from epo_lightning.experiment.config.settings import TrainerSettings
+from epo_lightning.files import write_file
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder, write_file
+from epo_lightning.run_folder import RunFolder
 from epo_lightning.scene import Scene
 
 WARM_UP, PROFILED = 5, 10

@@ -27,10 +27,11 @@ from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.settings import DriveSettings
 from epo_lightning.experiment.opening import open_checkpoint, settings_of
 from epo_lightning.experiment.provenance import commit
+from epo_lightning.files import write_file, write_json
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.report.closed_loop import SHARE, measures_table, times_table
-from epo_lightning.run_folder import RunFolder, write_file, write_json
+from epo_lightning.run_folder import RunFolder
 
 ROUNDS = 3
 """Best responses of every agent in turn."""

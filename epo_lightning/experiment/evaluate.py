@@ -23,10 +23,11 @@ from epo_lightning.experiment.config.settings import EvaluateSettings, Settings,
 from epo_lightning.experiment.opening import open_checkpoint, open_data, settings_of, split_of
 from epo_lightning.experiment.other_data import OtherData, open_other
 from epo_lightning.experiment.truth import TruthTest
+from epo_lightning.files import read_json, write_json
 from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.columns import TRUE
-from epo_lightning.run_folder import OTHER, RunFolder, discover, numbered, read_json, write_json
+from epo_lightning.run_folder import OTHER, RunFolder, discover, numbered
 from epo_lightning.schema import read
 
 SECTIONS = ("metrics", "truth")

@@ -24,9 +24,10 @@ from epo_lightning.experiment.dashboards.tensorboard import TensorBoard
 from epo_lightning.experiment.dashboards.wandb import WandB
 from epo_lightning.experiment.opening import open_checkpoint
 from epo_lightning.experiment.pictures import choose, draw, forecast_of
+from epo_lightning.files import read_json
 from epo_lightning.identity import SECTIONS, identity
 from epo_lightning.masking import mask
-from epo_lightning.run_folder import RunFolder, read_json, read_log
+from epo_lightning.run_folder import RunFolder, read_log
 from epo_lightning.schema import read
 
 

@@ -16,10 +16,11 @@ from epo_lightning.experiment.config.settings import ForecastSettings, PredictSe
 from epo_lightning.experiment.opening import open_checkpoint, open_data, settings_of
 from epo_lightning.experiment.other_data import open_other
 from epo_lightning.experiment.pictures import choose, draw, forecast_of, pick, spread
+from epo_lightning.files import write_file, write_json
 from epo_lightning.forecast import JointForecast
 from epo_lightning.forecasters import Forecaster
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder, write_file, write_json
+from epo_lightning.run_folder import RunFolder
 from epo_lightning.scene import KINDS, Scene
 
 MEANING = {

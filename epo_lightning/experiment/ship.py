@@ -25,10 +25,11 @@ from epo_lightning.experiment.opening import open_data, settings_of, split_of
 from epo_lightning.experiment.pictures import choose
 from epo_lightning.experiment.train import train
 from epo_lightning.experiment.verbs import generate_and_print
+from epo_lightning.files import read_json, write_file, write_json
 from epo_lightning.forecasters import load
 from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder, read_json, write_file, write_json
+from epo_lightning.run_folder import RunFolder
 
 SCENES = 16
 """Example scenes that ship with a run."""

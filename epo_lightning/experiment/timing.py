@@ -13,7 +13,8 @@ import torch
 
 from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.experiment.opening import open_checkpoint, open_data
-from epo_lightning.run_folder import RunFolder, write_json
+from epo_lightning.files import write_json
+from epo_lightning.run_folder import RunFolder
 
 SAMPLES, WARM_UP = 100, 10
 """Number of measured scenes, as in the paper; and number of forecasts before them, which are not measured (warm-up)."""

@@ -23,9 +23,10 @@ from epo_lightning.experiment.config.settings import (
     ReportSettings,
     measures,
 )
+from epo_lightning.files import read_json
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.labels import word
-from epo_lightning.run_folder import RunFolder, read_json
+from epo_lightning.run_folder import RunFolder
 from epo_lightning.schema import check_part, read
 
 SCHEMAS: dict[str, type] = {

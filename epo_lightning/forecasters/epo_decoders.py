@@ -42,7 +42,7 @@ def strategies_decoder(
     ranges = {} if motions is None and setting != "motions" else check_motions(motions)
     if setting == "decoded":
         return InitialStrategies(width, count, horizon, control_scale)
-    return ZeroStrategies(count, horizon) if setting == "zero" else Motions(horizon, count, **ranges)
+    return ZeroStrategies(count, horizon) if setting == "zero" else Motions(count, horizon, **ranges)
 
 
 def goals_decoder(energy: Energy, task: Task, width: int, variants: int) -> GoalDecoder | GivenGoals | NoGoals:

@@ -18,7 +18,7 @@ Function = Callable[..., Tensor]
 
 
 def change(
-    function: Function, at: tuple[Tensor, ...], directions: tuple[Float[Tensor, "D *_"], ...], *others: Tensor
+    function: Function, at: tuple[Tensor, ...], directions: tuple[Float[Tensor, " D *_"], ...], *others: Tensor
 ) -> Float[Tensor, "D *batch R"]:
     """Change J v of a function along D directions v of its arguments.
 

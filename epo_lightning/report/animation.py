@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from epo_lightning.files import whole_file
 from epo_lightning.forecast import JointForecast
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.scene_panels import (
@@ -29,7 +30,6 @@ from epo_lightning.report.scene_panels import (
 )
 from epo_lightning.report.scene_view import JointMode, SceneView, by_probability, joint_mode
 from epo_lightning.report.style import HISTORY, TRUTH, style
-from epo_lightning.run_folder import whole_file
 from epo_lightning.scene import HEADING, Scene
 
 FRAME, HOLD = 0.1, 1.2

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
+from epo_lightning.files import read_json
 from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.report.render import markdown
-from epo_lightning.run_folder import read_json
 
 Estimates = Mapping[str, Mapping[str, float]]
 """Estimates by measure."""

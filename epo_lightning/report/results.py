@@ -29,6 +29,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from epo_lightning.files import read_json, write_file
 from epo_lightning.identity import ELSEWHERE, SECTIONS, canonical
 from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError
@@ -48,7 +49,6 @@ from epo_lightning.report.entries import (
 from epo_lightning.report.records import CONFIG, RECORD, TIME, Records
 from epo_lightning.report.runs import EvaluatedRun, read_other, read_run, scored, scored_elsewhere
 from epo_lightning.report.write import Report, is_measured
-from epo_lightning.run_folder import read_json, write_file
 
 FORMAT, VERSION = "epo_lightning results", 1
 SETTINGS = (*SECTIONS, "title", "experiment", "budget")

@@ -25,6 +25,7 @@ import statistics
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 
+from epo_lightning.files import errors_naming, write_file
 from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.report.closed_loop import ClosedLoop, read_closed_loop
 from epo_lightning.report.columns import MISSING
@@ -36,7 +37,6 @@ from epo_lightning.report.rows import Row, plain_rows
 from epo_lightning.report.runs import EvaluatedRun, read_other, read_parts
 from epo_lightning.report.scores import Differences, Scores, average, below, table
 from epo_lightning.report.tables import build_tables, over_folds
-from epo_lightning.run_folder import errors_naming, write_file
 
 ENDING = ".j2"
 """Ending of the name of a template; its page has the same name without it."""

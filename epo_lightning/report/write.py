@@ -10,6 +10,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from epo_lightning.files import write_file
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.choices import choices_to_yaml
 from epo_lightning.report.costs import cost_sheets, timings_of
@@ -40,7 +41,7 @@ from epo_lightning.report.timings import places, read_timings, timing_sheet
 from epo_lightning.report.transfer import transfer_sheets, transfers, transfers_to_csv
 from epo_lightning.report.worth import LEGEND as WORTH_LEGEND
 from epo_lightning.report.worth import build_worth
-from epo_lightning.run_folder import RunFolder, write_file
+from epo_lightning.run_folder import RunFolder
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,9 @@ from epo_lightning import cli
 from epo_lightning.data.rpi.scenes import RPIData
 from epo_lightning.experiment import train
 from epo_lightning.experiment.config.compose import compose
+from epo_lightning.files import write_json
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder, write_json
+from epo_lightning.run_folder import RunFolder
 
 
 @pytest.mark.slow

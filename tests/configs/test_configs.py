@@ -23,9 +23,9 @@ from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.compose import compose, hydra, jobs, tree
 from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.experiment.config.sources import options_of
+from epo_lightning.files import read_json
 from epo_lightning.forecasters import build_forecaster
 from epo_lightning.identity import identity, row_identity
-from epo_lightning.run_folder import read_json
 from epo_lightning.schema import read
 from epo_lightning.task import Task
 

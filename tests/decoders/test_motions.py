@@ -38,14 +38,14 @@ def bends(states: torch.Tensor) -> torch.Tensor:
 
 def test_the_first_motion_continues_the_present_one():
     current = moving()
-    controls, states = rolled(Motions(10, 7, 2.0, 0.3), current)
+    controls, states = rolled(Motions(7, 10, 2.0, 0.3), current)
     assert (controls[:, 0] == 0).all()
     torch.testing.assert_close(states[:, 0, :, -1, 2:], current[..., 2:])
 
 
 def test_motions_are_drawn_from_the_mixture_of_the_paper():
     current = moving(fastest=1.0) + torch.tensor([0.0, 0.0, 0.0, 20.0])  # too fast to stop
-    _, states = rolled(Motions(12, 101, 2.0, 0.3), current)
+    _, states = rolled(Motions(101, 12, 2.0, 0.3), current)
     bend = bends(states)
     straight = (bend.abs() < 1e-9).all(-1)
     circle = ~straight & (bend.diff(dim=-1).abs() < 1e-9).all(-1)
@@ -74,7 +74,7 @@ def test_motions_are_drawn_from_the_mixture_of_the_paper():
 )
 def test_motions_stay_within_their_ranges_and_never_reverse(speed, acceleration, curvature, count, horizon, dtype):
     current = torch.tensor([[[1.0, -2.0, 0.7, speed]]], dtype=dtype)
-    controls, states = rolled(Motions(horizon, count, acceleration, curvature), current)
+    controls, states = rolled(Motions(count, horizon, acceleration, curvature), current)
     assert controls.shape == (1, count, 1, horizon, 2)
     tolerance = 1e-4 * (1.0 + speed) if dtype == torch.float32 else 1e-9
     assert (states[..., SPEED] >= -tolerance).all()
@@ -86,7 +86,7 @@ def test_motions_stay_within_their_ranges_and_never_reverse(speed, acceleration,
 
 def test_stopped_agents_stay_and_standing_agents_do_not_turn():
     slow = torch.tensor([[[0.0, 0.0, 0.3, 0.4], [5.0, 0.0, 1.0, 0.0]]], dtype=torch.float64)
-    controls, states = rolled(Motions(20, 41, 1.0, 0.5), slow)
+    controls, states = rolled(Motions(41, 20, 1.0, 0.5), slow)
     speed = states[..., SPEED]
     stopped = speed[:, :, 0, -1].abs() < 1e-12
     assert 0 < stopped.sum() < 41
@@ -100,19 +100,19 @@ def test_stopped_agents_stay_and_standing_agents_do_not_turn():
 
 def test_agents_rolling_backwards_are_slowed_within_the_range():
     current = torch.tensor([[[0.0, 0.0, 0.0, -0.2]]], dtype=torch.float64)
-    controls, states = rolled(Motions(10, 21, 1.0, 0.5), current)
+    controls, states = rolled(Motions(21, 10, 1.0, 0.5), current)
     assert (controls[..., 0].abs() <= 1.0).all()
     assert (states[..., SPEED] >= -0.2 - 1e-12).all()
 
 
 @pytest.mark.parametrize("count", [2, 3, 6, 12, 100])
 def test_candidates_are_distinct_and_equal_for_all_agents(count):
-    motions = Motions(8, count, 2.0, 0.3)
+    motions = Motions(count, 8, 2.0, 0.3)
     current = moving() + torch.tensor([0.0, 0.0, 0.0, 2.0])  # too fast to stand after a step, when all brake alike
     controls = motions.controls(current, DT)
     different = (controls[:, :, None] - controls[:, None]).abs().amax((-1, -2)).amin((0, 3))
     assert (different[~torch.eye(count, dtype=torch.bool)] > 1e-6).all()
-    assert torch.equal(controls, Motions(8, count, 2.0, 0.3).controls(current, DT)), "nothing is drawn at random"
+    assert torch.equal(controls, Motions(count, 8, 2.0, 0.3).controls(current, DT)), "nothing is drawn at random"
     assert torch.equal(controls[1:, :, 2:3], motions.controls(current[1:, 2:3], DT)), (
         "agents do not matter to each other"
     )

@@ -14,8 +14,9 @@ from experiment.conftest import epo  # noqa: F401 - a fixture
 
 from epo_lightning.experiment.config.settings import DriveSettings
 from epo_lightning.experiment.drive import _titles, folder_of
+from epo_lightning.files import read_json
 from epo_lightning.report.closed_loop import read_closed_loop
-from epo_lightning.run_folder import RunFolder, read_json
+from epo_lightning.run_folder import RunFolder
 
 SMALL = ["episodes=2", "timed=1", "others=[ignores]"]
 QUICK = [

@@ -11,9 +11,10 @@ import torch
 from experiment.conftest import TINY, Epo
 from experiment.test_resume import WORSENING, begin_and_stop
 
+from epo_lightning.files import write_json
 from epo_lightning.forecasters.checkpoint import read_checkpoint
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder, read_log, write_json
+from epo_lightning.run_folder import RunFolder, read_log
 
 ROW = "experiment=rpi/v_lstm_sc"
 

@@ -23,8 +23,9 @@ from epo_lightning import cli
 from epo_lightning.experiment import distributed, follower
 from epo_lightning.experiment.callbacks import RandomStates
 from epo_lightning.experiment.distributed import DDP, Place
+from epo_lightning.files import read_json
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder, read_json
+from epo_lightning.run_folder import RunFolder
 
 ROOT = Path(__file__).parents[2]
 FIXTURE = ROOT / "tests" / "fixtures" / "exid_sim"

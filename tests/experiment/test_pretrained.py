@@ -17,8 +17,9 @@ from epo_lightning.experiment import ship as shipping
 from epo_lightning.experiment.card import SCORES, Recipe, card, recipe_of, recipes
 from epo_lightning.experiment.config.compose import compose
 from epo_lightning.experiment.ship import SCENES, score_examples, ship
+from epo_lightning.files import read_json
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder, read_json
+from epo_lightning.run_folder import RunFolder
 
 NAMES = pretrained.names()
 ROW = "rpi/v_lstm_epo"

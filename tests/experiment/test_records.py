@@ -17,8 +17,9 @@ from experiment.conftest import TINY, Epo
 from report.run_folders import make_run, scores
 
 from epo_lightning.experiment import provenance
+from epo_lightning.files import write_file
 from epo_lightning.masking import is_masked, mask
-from epo_lightning.run_folder import RunFolder, write_file
+from epo_lightning.run_folder import RunFolder
 
 ROW = "experiment=rpi/v_lstm_sc"
 

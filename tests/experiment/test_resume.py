@@ -18,9 +18,10 @@ from lightning.pytorch import Trainer
 from epo_lightning.experiment import train as training
 from epo_lightning.experiment.callbacks import LastCheckpoint
 from epo_lightning.experiment.csv_log import CSVLog
+from epo_lightning.files import read_json
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder, read_json
+from epo_lightning.run_folder import RunFolder
 
 WORSENING = ("train", "experiment=rpi/v_lstm_sc", *TINY, "optimizer.lr=0.05", "trainer.max_epochs=4", "score=test")
 """A step so large that the validation gets worse: the best epoch is not the last one."""

@@ -16,10 +16,11 @@ from filelock import FileLock
 
 import epo_lightning
 from epo_lightning.experiment import evaluate
+from epo_lightning.files import write_json
 from epo_lightning.forecasters.checkpoint import read_checkpoint
 from epo_lightning.identity import identity
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder, write_json
+from epo_lightning.run_folder import RunFolder
 from epo_lightning.solvers.gauss_newton.kernel import interface
 
 ROW = "experiment=rpi/v_lstm_sc"

@@ -13,7 +13,7 @@ from epo_lightning.experiment import assembly, train
 from epo_lightning.experiment.config.compose import compose, tree
 from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.experiment.evaluate import evaluate
-from epo_lightning.run_folder import read_json
+from epo_lightning.files import read_json
 from epo_lightning.schema import read
 
 FOLDER = tree() / "conf" / "experiment"

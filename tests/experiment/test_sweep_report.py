@@ -14,8 +14,9 @@ from epo_lightning.experiment.config.settings import ReportSettings
 from epo_lightning.experiment.report import of_sweep, report
 from epo_lightning.experiment.sweeps.sweep import Sweep
 from epo_lightning.experiment.sweeps.watch import status
+from epo_lightning.files import write_file, write_json
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder, write_file, write_json
+from epo_lightning.run_folder import RunFolder
 
 
 def begin(runs: Path, name: str, folders: dict[str, str | None], score: str | list[str] = "test") -> Sweep:

@@ -17,10 +17,11 @@ from epo_lightning.experiment import assembly, timing, verbs
 from epo_lightning.experiment.callbacks import RandomStates
 from epo_lightning.experiment.config.settings import Settings, measures
 from epo_lightning.experiment.timing import SAMPLES, measure
+from epo_lightning.files import read_json, write_json
 from epo_lightning.forecasters import Forecaster
 from epo_lightning.identity import identity
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder, discover, read_json, write_json
+from epo_lightning.run_folder import RunFolder, discover
 from epo_lightning.schema import read
 
 DRAWN = ("data=drawn", "data.scenes=32", "callbacks.progress=none")

@@ -10,8 +10,9 @@ import torch
 
 from epo_lightning.experiment import truth
 from epo_lightning.experiment.evaluate import keep
+from epo_lightning.files import read_json, write_json
 from epo_lightning.forecast import GameParameters
-from epo_lightning.run_folder import RunFolder, read_json, write_json
+from epo_lightning.run_folder import RunFolder
 
 
 def games(weight: torch.Tensor, scale: torch.Tensor, sign: float = 1.0) -> GameParameters:

@@ -26,10 +26,10 @@ from epo_lightning.experiment.config.compose import compose, jobs, tree
 from epo_lightning.experiment.evaluate import evaluate
 from epo_lightning.experiment.predict import predict
 from epo_lightning.experiment.verbs import check_settings
+from epo_lightning.files import read_json
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.identity import differences
 from epo_lightning.registry import register
-from epo_lightning.run_folder import read_json
 from epo_lightning.scene import Scene
 
 ROWS = sorted(file.stem for file in (tree() / "conf" / "experiment" / "urban").glob("*.yaml"))

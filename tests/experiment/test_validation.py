@@ -13,9 +13,10 @@ from experiment.conftest import TINY, Epo
 from epo_lightning.experiment import assembly, callbacks
 from epo_lightning.experiment.config.compose import compose
 from epo_lightning.experiment.config.settings import Settings
+from epo_lightning.files import read_json
 from epo_lightning.forecasters.step_means import StepMeans
 from epo_lightning.metrics.forecast import EQUILIBRIUM_METRICS
-from epo_lightning.run_folder import RunFolder, read_json, read_log
+from epo_lightning.run_folder import RunFolder, read_log
 from epo_lightning.schema import read
 
 WORDS = ("train", "experiment=rpi/v_lstm_sc", *TINY, "trainer.max_epochs=4")

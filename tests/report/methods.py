@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from epo_lightning.run_folder import RunFolder, write_json
+from epo_lightning.files import write_json
+from epo_lightning.run_folder import RunFolder
 
 from .run_folders import make_run, scores
 

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from epo_lightning.run_folder import RunFolder, write_json
+from epo_lightning.files import write_json
+from epo_lightning.run_folder import RunFolder
 
 from .run_folders import make_run, scores
 

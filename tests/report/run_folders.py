@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from epo_lightning.run_folder import RunFolder, write_json
+from epo_lightning.files import write_json
+from epo_lightning.run_folder import RunFolder
 
 METRICS = ("minADE", "minFDE", "minSADE", "minSFDE", "overlap_jfp", "overlap_authors")
 

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from epo_lightning.files import write_json
 from epo_lightning.identity import identity, row_identity
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.rows import Row, of_different_code, untaught
@@ -20,7 +21,7 @@ from epo_lightning.report.runs import collect, find_runs
 from epo_lightning.report.statistics import build_comparisons
 from epo_lightning.report.tables import build_tables, distinct, over_folds
 from epo_lightning.report.write import Report, write_report
-from epo_lightning.run_folder import RunFolder, write_json
+from epo_lightning.run_folder import RunFolder
 from report.table_rows import rows_of
 
 from .run_folders import make_run, scores

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from epo_lightning.files import read_json, write_json
 from epo_lightning.report.charts import charts_of
 from epo_lightning.report.columns import Column, significant
 from epo_lightning.report.costs import cost_sheets, last_fifth
@@ -20,7 +21,6 @@ from epo_lightning.report.runs import collect, find_runs
 from epo_lightning.report.tables import Table, build_tables
 from epo_lightning.report.timings import duration, read_timings
 from epo_lightning.report.write import Report, write_report
-from epo_lightning.run_folder import read_json, write_json
 
 from .methods import METHODS, PARTS, of_methods, time_it
 from .page_runs import timed

@@ -12,13 +12,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from epo_lightning.files import write_json
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.paper import papers_name
 from epo_lightning.report.render import legend
 from epo_lightning.report.rows import Cell, of_different_batches
 from epo_lightning.report.runs import collect, data_name
 from epo_lightning.report.tables import build_tables
-from epo_lightning.run_folder import write_json
 from report.table_rows import rows_of
 
 from .run_folders import make_run, scores

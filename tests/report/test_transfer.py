@@ -11,11 +11,12 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from epo_lightning.files import write_json
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.runs import read_parts
 from epo_lightning.report.transfer import labels_of, transfer_sheets, transfers, transfers_to_csv
 from epo_lightning.report.write import Report, write_report
-from epo_lightning.run_folder import RunFolder, write_json
+from epo_lightning.run_folder import RunFolder
 
 from .run_folders import make_run, scores
 

@@ -14,11 +14,11 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
+from epo_lightning.files import write_json
 from epo_lightning.metrics.functional.interaction import SUBSETS
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.columns import INTERACTIVE
 from epo_lightning.report.write import Report, write_report
-from epo_lightning.run_folder import write_json
 
 from .page_runs import over_runtime, over_steps, rows_with_seeds
 from .run_folders import make_run, scores

@@ -27,10 +27,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 from epo_lightning.experiment.config.settings import Measured, measures
+from epo_lightning.files import read_json, write_file, write_json
 from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.entries import OBJECT, OBJECTS, TEXT, TEXTS, WHOLE, Check, check_entries, check_known
-from epo_lightning.run_folder import LOCK, RunFolder, read_json, write_file, write_json
+from epo_lightning.run_folder import LOCK, RunFolder
 
 State = Literal["done", "running", "interrupted", "trained, not scored", "failed", "waiting"]
 BESIDE = (

@@ -22,6 +22,7 @@ from epo_lightning.experiment.sweeps.sweep import Job, State, Sweep
 from epo_lightning.experiment.sweeps.watch import news, note_former, status, summary
 from epo_lightning.experiment.sweeps.work import job_of
 from epo_lightning.experiment.verbs import check_settings, make_data
+from epo_lightning.files import read_json
 from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.report.choices import Choices, read_choices
 from epo_lightning.report.entries import TEXT, WHOLE, check_entries
@@ -29,7 +30,7 @@ from epo_lightning.report.folds import fold
 from epo_lightning.report.labels import value_text, word
 from epo_lightning.report.rows import unequal_conditions
 from epo_lightning.report.runs import UNLEARNED
-from epo_lightning.run_folder import RunFolder, numbered, read_json
+from epo_lightning.run_folder import RunFolder, numbered
 from epo_lightning.schema import read
 
 CHOICES = "choices="

@@ -16,10 +16,10 @@ from rich.table import Table
 from rich.text import Text
 
 from epo_lightning.experiment.sweeps.sweep import Job, State, Sweep
+from epo_lightning.files import read_json
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.labels import MOST, short_keys, shortened, shown, word
 from epo_lightning.report.timings import duration
-from epo_lightning.run_folder import read_json
 
 STYLES: dict[State, str] = {
     "done": "green",

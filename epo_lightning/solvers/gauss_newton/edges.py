@@ -78,16 +78,16 @@ class Edges:
         start = agents * problem
         return cls(start + first[within], start + second[within], pair, batch * modes, agents, every=False)
 
-    def of_pairs(self, values: Float[Tensor, "pairs *rest"]) -> Float[Tensor, "E *rest"]:
+    def of_pairs(self, values: Float[Tensor, " pairs *rest"]) -> Float[Tensor, " E *rest"]:
         """The values of these edges, from those of all pairs of all problems."""
         return values if self.every else values.index_select(0, self.pair)
 
-    def ends(self, values: Float[Tensor, "S N *rest"]) -> tuple[Float[Tensor, "E *rest"], Float[Tensor, "E *rest"]]:
+    def ends(self, values: Float[Tensor, "S N *rest"]) -> tuple[Float[Tensor, " E *rest"], Float[Tensor, " E *rest"]]:
         """The values of the first and of the second agent of every edge."""
         flat = values.flatten(0, 1)
         return flat.index_select(0, self.first), flat.index_select(0, self.second)
 
-    def difference(self, values: Float[Tensor, "S N *rest"]) -> Float[Tensor, "E *rest"]:
+    def difference(self, values: Float[Tensor, "S N *rest"]) -> Float[Tensor, " E *rest"]:
         """The first agent's value minus the second's."""
         first, second = self.ends(values)
         return first.sub_(second)
@@ -151,7 +151,7 @@ class Group:
             self.second[kept],
         )
 
-    def of_edges(self, values: Float[Tensor, "E *rest"]) -> Float[Tensor, "e *rest"]:
+    def of_edges(self, values: Float[Tensor, " E *rest"]) -> Float[Tensor, " e *rest"]:
         """The values of this group's edges."""
         return values if self.edges is None else values.index_select(0, self.edges)
 

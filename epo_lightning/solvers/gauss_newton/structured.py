@@ -115,7 +115,7 @@ class Game:
     scene: Scene
     parameters: GameParameters
     step_size: float
-    damping: Float[Tensor, "S *agents"]
+    damping: Float[Tensor, " S *agents"]
     split: bool
     exact: bool = False
 
@@ -238,7 +238,7 @@ class Factorisation:
 
 
 def factorise(
-    model: QuadraticModel, damping: Float[Tensor, "S *agents"], split: bool, retry: bool | None = None
+    model: QuadraticModel, damping: Float[Tensor, " S *agents"], split: bool, retry: bool | None = None
 ) -> Factorisation:
     """Factorise the matrices of all problems; if problems are split, the matrix of each component separately.
 
@@ -273,7 +273,7 @@ def factorise(
 
 def _retry(
     model: QuadraticModel,
-    damping: Float[Tensor, "S *agents"],
+    damping: Float[Tensor, " S *agents"],
     group: Group,
     factors: blocks.Factors,
     outcome: Int[Tensor, " C"],

@@ -26,7 +26,8 @@ from experiment.sweeps.rpi_sweep import SRC, the_sweep
 from epo_lightning.experiment.sweeps import sweeping
 from epo_lightning.experiment.sweeps.sweep import Job, Sweep
 from epo_lightning.experiment.sweeps.watch import result
-from epo_lightning.run_folder import RunFolder, discover, read_json
+from epo_lightning.files import read_json
+from epo_lightning.run_folder import RunFolder, discover
 
 SWEEP = ("sweep", "rpi_main", *TINY, "seed=0,1", "score=test")
 

@@ -18,9 +18,10 @@ from epo_lightning.experiment.sweeps.sweep import Job, Sweep, label
 from epo_lightning.experiment.sweeps.sweeping import _listed
 from epo_lightning.experiment.sweeps.watch import _scoring, how_far, names_of, result
 from epo_lightning.experiment.sweeps.work import job_of
+from epo_lightning.files import write_json
 from epo_lightning.identity import identity
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder, write_json
+from epo_lightning.run_folder import RunFolder
 
 
 def test_records_of_older_versions_are_read(tmp_path: Path) -> None:
