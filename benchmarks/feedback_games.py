@@ -158,7 +158,7 @@ def generated(games: Games, start: Tensor) -> Tensor:
     constants, solved = GameConstants().array(), []
     for row, steps in enumerate(scene.game_steps.tolist()):
         u = np.ascontiguousarray(start[row, 0, :, :steps].transpose(0, 1).flatten(1).numpy())
-        given = (agents[row], u, constants, goals[row], weights[row], settings.array())
+        given = (agents[row], u, constants, goals[row], weights[row], settings)
         solved.append(generator.solve_feedback(*given)[2])
     return torch.tensor(solved)
 

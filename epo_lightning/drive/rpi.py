@@ -37,7 +37,7 @@ TOGETHER = 50
 """Largest number of episodes begun together: with fewer an episode takes longer, with more progress is rarely told."""
 RECONSIDERED = 5
 """Steps after which a pedestrian who plays looks for a better solution than that near its plan."""
-_SETTINGS = PotentialSettings().array()
+_SETTINGS = PotentialSettings()
 _BOTH = np.ones(AGENTS)
 ENERGY = FeatureEnergy(
     own=("goal", "heading", "vel", "acc", "turnr", "velb", "accb", "turnrb"),

@@ -96,9 +96,9 @@ def line_game():
 def test_the_potential_solver_solves_an_lq_game_in_one_step():
     A, B, own_Q, own_q, R, r, pair_Q, pair_q = line_game()
     exact = dense.open_loop(A, B, own_Q.sum(0) + pair_Q, own_q.sum(0) + pair_q, R.sum(0), r.sum(0), START[[0, 3, 4, 7]])
-    settings = dataclasses.replace(PotentialSettings(), exact_below=0.0)  # sideways the exact Hessian is not convex
+    settings = PotentialSettings(exact_below=0.0)  # sideways the exact Hessian is not convex
     x, u, converged, iterations = solve_potential(
-        START, np.zeros((STEPS, 4)), LINE.array(), GOALS, WEIGHT, np.ones(2), settings.array()
+        START, np.zeros((STEPS, 4)), LINE.array(), GOALS, WEIGHT, np.ones(2), settings
     )
     assert converged
     assert iterations == 1
@@ -110,10 +110,10 @@ def test_the_feedback_solver_solves_an_lq_game_in_one_step():
     A, B, own_Q, own_q, R, r, pair_Q, pair_q = line_game()
     gains, offsets = dense.coupled_riccati(A, B, own_Q + pair_Q, own_q + pair_q, R, r, np.array([0, 1]))
     exact = play(A, B, gains, offsets, START[[0, 3, 4, 7]])
-    settings = dataclasses.replace(FeedbackSettings(), step=1.0, regularisation=0.0, largest_move=1e3)
+    settings = FeedbackSettings(step=1.0, regularisation=0.0, largest_move=1e3)
     for iterations in (1, 2):  # the second step changes nothing
-        limited = dataclasses.replace(settings, iterations=iterations)
-        x, u, converged, _ = solve_feedback(START, np.zeros((STEPS, 4)), LINE.array(), GOALS, WEIGHT, limited.array())
+        limited = settings._replace(iterations=iterations)
+        x, u, converged, _ = solve_feedback(START, np.zeros((STEPS, 4)), LINE.array(), GOALS, WEIGHT, limited)
         np.testing.assert_allclose(u[:, [0, 2]], exact, atol=1e-8)
         assert converged == (iterations == 2)
         assert np.abs(x[:, [1, 2, 5, 6]]).max() == 0.0

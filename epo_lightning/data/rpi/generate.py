@@ -41,7 +41,7 @@ def pool_config(seed: int, games: int, placements: int, solver: str, recipe: int
         "games": games,
         "placements": placements,
         "solver": solver,
-        "settings": dataclasses.asdict(SETTINGS[solver]),
+        "settings": SETTINGS[solver]._asdict(),
         "constants": dataclasses.asdict(GameConstants()),
         "history": HISTORY,
         "future": FUTURE,

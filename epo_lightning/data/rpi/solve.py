@@ -8,9 +8,9 @@ with the settings of Peters (2020). Its tolerance of 5 cm leaves solutions that 
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -21,9 +21,8 @@ from epo_lightning.data.rpi.game import Array
 from epo_lightning.data.rpi.lq import lq_game, lq_minimum
 
 
-@dataclass(frozen=True)
-class PotentialSettings:
-    """Settings of the potential solver.
+class PotentialSettings(NamedTuple):
+    """Settings of the potential solver. Compiled functions read named tuples by attribute.
 
     Attributes:
         tolerance: largest absolute entry of the gradient at which the solver stops.
@@ -38,13 +37,8 @@ class PotentialSettings:
     exact_from: int = 25
     exact_below: float = 20.0
 
-    def array(self) -> Array:
-        """The settings as the vector that the compiled solver reads."""
-        return np.array(dataclasses.astuple(self), dtype=np.float64)
 
-
-@dataclass(frozen=True)
-class FeedbackSettings:
+class FeedbackSettings(NamedTuple):
     """Settings of the feedback solver, by default those of Peters (2020).
 
     Attributes:
@@ -62,10 +56,6 @@ class FeedbackSettings:
     tolerance: float = 0.05
     iterations: int = 200
     regularisation: float = 5.0
-
-    def array(self) -> Array:
-        """The settings as the vector that the compiled solver reads."""
-        return np.array(dataclasses.astuple(self), dtype=np.float64)
 
 
 SETTINGS: Mapping[str, PotentialSettings | FeedbackSettings] = {
@@ -100,7 +90,7 @@ def total(x: Array, u: Array, c: Array, goals: Array, w: float) -> float:
 
 @njit(cache=True)
 def solve_potential(
-    start: Array, u: Array, c: Array, goals: Array, w: float, moves: Array, settings: Array
+    start: Array, u: Array, c: Array, goals: Array, w: float, moves: Array, settings: PotentialSettings
 ) -> tuple[Array, Array, bool, int]:
     """Minimum of the potential over the controls of the agents whose entry of ``moves`` is 1.
 
@@ -112,7 +102,6 @@ def solve_potential(
     Returns:
         states [K+1, 8], controls [K, 4], whether the gradient fell below the tolerance, iterations.
     """
-    tolerance, iterations, exact_from, exact_below = settings[0], int(settings[1]), int(settings[2]), settings[3]
     steps = len(u)
     A, B = np.empty((steps, 8, 8)), np.empty((steps, 8, 4))
     Q, q = np.empty((steps + 1, 8, 8)), np.empty((steps + 1, 8))
@@ -121,7 +110,7 @@ def solve_potential(
     cost = total(x, u, c, goals, w)
     damping = 0.0
     exact = False
-    for iteration in range(iterations + 1):
+    for iteration in range(settings.iterations + 1):
         game.linearise(x, c, moves, A, B)
         Q[:], q[:], R[:], r[:] = 0.0, 0.0, 0.0, 0.0
         for i in range(2):
@@ -131,13 +120,13 @@ def solve_potential(
         game.add_pair(x, c, w, exact, Q, q)
         gradient, costates = game.adjoint(A, B, q, r)
         size = np.abs(gradient).max()
-        if size < tolerance:
+        if size < settings.tolerance:
             return x, u, True, iteration
         if exact:
             game.add_curvature(x, c, costates, Q)
-        exact = size < exact_below or iteration + 1 >= exact_from
+        exact = size < settings.exact_below or iteration + 1 >= settings.exact_from
         moved = False
-        while not moved and damping < 1e8 and iteration < iterations:
+        while not moved and damping < 1e8 and iteration < settings.iterations:
             convex, gains, offsets, promised = lq_minimum(A, B, Q, q, R, r, damping)
             scale = 1.0
             while convex and not moved and scale > 1e-3:
@@ -149,52 +138,50 @@ def solve_potential(
             damping = (damping / 10.0 if damping > 1.0 else 0.0) if moved else max(10.0 * damping, 1.0)
         if not moved:
             return x, u, False, iteration
-    return x, u, False, iterations
+    return x, u, False, settings.iterations
 
 
 @njit(cache=True)
 def solve_feedback(
-    start: Array, u: Array, c: Array, goals: Array, w: float, settings: Array
+    start: Array, u: Array, c: Array, goals: Array, w: float, settings: FeedbackSettings
 ) -> tuple[Array, Array, bool, int]:
     """Approximate feedback Nash equilibrium: LQ games around the trajectory are solved until it stops changing.
 
     Returns:
         states [K+1, 8], controls [K, 4], whether it converged, iterations.
     """
-    first, halvings, largest, tolerance = settings[0], int(settings[1]), settings[2], settings[3]
-    iterations, regularisation = int(settings[4]), settings[5]
     steps = len(u)
     owner = np.array([0, 0, 1, 1])
     A, B = np.empty((steps, 8, 8)), np.empty((steps, 8, 4))
     Q, q = np.empty((2, steps + 1, 8, 8)), np.empty((2, steps + 1, 8))
     R, r = np.empty((2, steps, 4, 4)), np.empty((2, steps, 4))
     x = game.rollout(start, u, c[game.DT])
-    for iteration in range(iterations):
+    for iteration in range(settings.iterations):
         game.linearise(x, c, np.ones(2), A, B)
         Q[:], q[:], R[:], r[:] = 0.0, 0.0, 0.0, 0.0
         for i in range(2):
             game.add_own(i, x, u, c, goals, Q[i], q[i], R[i], r[i])
             game.add_pair(x, c, w, False, Q[i], q[i])
             for j in range(8):
-                Q[i, :, j, j] += regularisation
+                Q[i, :, j, j] += settings.regularisation
             for j in range(4):
-                R[i, :, j, j] += regularisation
+                R[i, :, j, j] += settings.regularisation
         unique, gains, offsets = lq_game(A, B, Q, q, R, r, owner)
         if not unique:
             return x, u, False, iteration
-        scale, change = first, np.inf
-        for _ in range(halvings + 1):
+        scale, change = settings.step, np.inf
+        for _ in range(settings.halvings + 1):
             new_x, new_u = follow(x, u, gains, offsets, scale, c[game.DT])
             change = np.abs(new_x - x).max()
-            if change <= largest:
+            if change <= settings.largest_move:
                 break
             scale *= 0.5
-        if not change <= largest:
+        if not change <= settings.largest_move:
             return x, u, False, iteration
         x, u = new_x, new_u
-        if change < tolerance:
+        if change < settings.tolerance:
             return x, u, True, iteration + 1
-    return x, u, False, iterations
+    return x, u, False, settings.iterations
 
 
 @dataclass(frozen=True)
@@ -228,13 +215,12 @@ def solve(
 
     The loop over the starts is not compiled, because compiling it would compile both solvers again.
     """
-    chosen, both = SETTINGS[solver], np.ones(2)
-    settings, feedback = chosen.array(), isinstance(chosen, FeedbackSettings)
+    settings, both = SETTINGS[solver], np.ones(2)
     count, steps = starts.shape[:2]
     states, controls = np.empty((count, steps + 1, 8)), np.empty((count, steps, 4))
     converged, facts = np.empty(count, dtype=np.bool_), np.empty((count, 7))
     for s, strategy in enumerate(np.ascontiguousarray(starts)):
-        if feedback:
+        if isinstance(settings, FeedbackSettings):
             x, u, done, iterations = solve_feedback(start, strategy, constants, goals, weight, settings)
         else:
             x, u, done, iterations = solve_potential(start, strategy, constants, goals, weight, both, settings)

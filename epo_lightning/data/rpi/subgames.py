@@ -59,7 +59,7 @@ def best_response_gain(
     The search for the best response starts from the agent's strategy plus ``noise`` [K, 4]; the other strategy is fixed.
     """
     best = 0.0
-    settings = PotentialSettings().array()
+    settings = PotentialSettings()
     for i in range(AGENTS):
         moves = np.zeros(AGENTS)
         moves[i] = 1.0

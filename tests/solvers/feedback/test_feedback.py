@@ -52,14 +52,14 @@ def meeting(*directions: float, modes: int = 2, weight: float = 8.0) -> tuple[Sc
 def test_solutions_are_those_of_the_generator_of_rpi() -> None:
     """The same games, solved by code that the solver shares no line with."""
     constants, steps = GameConstants(), 60
-    settings = dataclasses.replace(generator.SETTINGS["feedback"], step=1.0, tolerance=1e-9, iterations=400).array()
+    settings = generator.FeedbackSettings(step=1.0, tolerance=1e-9, iterations=400)
     for number in range(3):
         game = main_game(3, number, 1, 4, constants)
         start = game.start.copy()
         start[[3, 7]] = 0.6  # already on their way
         u = np.zeros((steps, 4))
         given = (start, u, constants.array(), game.goals, game.weight)
-        _, u, _, _ = generator.solve_potential(*given, np.ones(2), generator.SETTINGS["potential"].array())
+        _, u, _, _ = generator.solve_potential(*given, np.ones(2), generator.PotentialSettings())
         x, _, converged, _ = generator.solve_feedback(start, u, *given[2:], settings)
         assert converged
         agents = torch.from_numpy(start).view(1, 2, 4)
