@@ -158,18 +158,18 @@ class _PastGame:
 
     def solve(
         self,
-        s: Float[Tensor, "S C"],
-        start: Float[Tensor, "S C N T 2"],
+        s: Float[Tensor, "scenes C"],
+        start: Float[Tensor, "scenes C N T 2"],
         minimiser: Minimiser,
-        scenes: Int[Tensor, " S"],
-    ) -> tuple[Float[Tensor, "S C R"], Float[Tensor, "S C N T 2"]]:
+        scenes: Int[Tensor, " scenes"],
+    ) -> tuple[Float[Tensor, "scenes C R"], Float[Tensor, "scenes C N T 2"]]:
         """Misses of the history, in units of the noise, and strategies, of copies of the games of some scenes.
 
         Args:
             s: for every copy; C is a multiple of the number of games. Copies are solved at once, as modes.
             start: initial strategies.
             minimiser: the solver.
-            scenes: the scenes S to which these belong.
+            scenes: the scenes to which these belong.
         """
         of_scenes, past = self.game[scenes], self.past[scenes]
         count = s.shape[1] // self.games
@@ -183,8 +183,8 @@ class _PastGame:
         return torch.where(present, missed, 0.0).flatten(2) / self.noise, found.controls
 
     def misses(
-        self, s: Float[Tensor, "S M"], start: Tensor, minimiser: Minimiser, scenes: Tensor
-    ) -> tuple[Float[Tensor, "S M R"], Float[Tensor, "S M R"], Float[Tensor, "S _ N T 2"]]:
+        self, s: Float[Tensor, "scenes M"], start: Tensor, minimiser: Minimiser, scenes: Tensor
+    ) -> tuple[Float[Tensor, "scenes M R"], Float[Tensor, "scenes M R"], Float[Tensor, "scenes _ N T 2"]]:
         """Misses, their derivative by s, and the strategies of two copies of every game: at s, and beside it."""
         missed, controls = self.solve(torch.cat((s, s + _DIFFERENCE), 1), start, minimiser, scenes)
         here, beside = missed.chunk(2, 1)
@@ -206,7 +206,9 @@ class _PastGame:
         return s, torch.cat((controls, controls), 1)
 
 
-def _cost(missed: Float[Tensor, "S M R"], s: Float[Tensor, "S M"], spread: float) -> Float[Tensor, "S M"]:
+def _cost(
+    missed: Float[Tensor, "scenes M R"], s: Float[Tensor, "scenes M"], spread: float
+) -> Float[Tensor, "scenes M"]:
     """Cost that a calibration minimises; infinite where a game has no solution."""
     cost = missed.square().sum(-1) + s.square() / spread**2
     return torch.where(cost.isfinite(), cost, math.inf)

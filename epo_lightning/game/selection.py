@@ -15,8 +15,8 @@ Function = Callable[[Scene, GameParameters, Tensor], tuple[Tensor, ...]]
 """(scene, parameters, controls) -> tensors [B, M, ...]."""
 
 
-def games(parameters: GameParameters, scenes: Int[Tensor, " S"], modes: Int[Tensor, " S"]) -> GameParameters:
-    """S games of a batch, each as a scene with one mode: [B, M, ...] becomes [S, 1, ...].
+def games(parameters: GameParameters, scenes: Int[Tensor, " games"], modes: Int[Tensor, " games"]) -> GameParameters:
+    """Some games of a batch, each as a scene with one mode: [B, M, ...] becomes [games, 1, ...].
 
     A tensor with one entry for all modes, [B, 1, ...], is used for every chosen mode.
     """

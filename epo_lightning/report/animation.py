@@ -102,7 +102,7 @@ def _moving(axes: Axes, view: SceneView, future: JointMode, parts: int) -> Itera
 
 def _until(
     states: Float[np.ndarray, "T 4"], seen: Bool[np.ndarray, " T"], t: float
-) -> tuple[Float[np.ndarray, "S 4"], Bool[np.ndarray, " S"]]:
+) -> tuple[Float[np.ndarray, "steps 4"], Bool[np.ndarray, " steps"]]:
     """States and mask of a track up to step ``t``, interpolated between steps; unobserved after the end of the track."""
     step = int(t)
     path, mask = states[: step + 1], seen[: step + 1]

@@ -40,7 +40,7 @@ class SceneView:
     names: Sequence[str]
     size: Float[np.ndarray, "N 2"] | None
     disc: Bool[np.ndarray, " N"]
-    road: Float[np.ndarray, "S 2 2"] | None
+    road: Float[np.ndarray, "segments 2 2"] | None
     origin: Float[np.ndarray, " 2"]
     angle: float
 
@@ -153,14 +153,14 @@ def _direction(heading: Float[np.ndarray, " N"], speed: Float[np.ndarray, " N"])
     return angle if (weight * np.cos(heading - angle)).sum() >= 0 else angle + np.pi
 
 
-def _rotated(points: Float[np.ndarray, "*S 2"], origin: np.ndarray, angle: float) -> Float[np.ndarray, "*S 2"]:
+def _rotated(points: Float[np.ndarray, "*shape 2"], origin: np.ndarray, angle: float) -> Float[np.ndarray, "*shape 2"]:
     """Points in the frame at ``origin`` whose x axis has direction ``angle``."""
     x, y = np.moveaxis(points - origin, -1, 0)
     with np.errstate(invalid="ignore"):  # infinity times zero; points that are not finite are left out later
         return np.stack([np.cos(angle) * x + np.sin(angle) * y, np.cos(angle) * y - np.sin(angle) * x], axis=-1)
 
 
-def _turned(states: Float[np.ndarray, "*S 4"], origin: np.ndarray, angle: float) -> Float[np.ndarray, "*S 4"]:
+def _turned(states: Float[np.ndarray, "*shape 4"], origin: np.ndarray, angle: float) -> Float[np.ndarray, "*shape 4"]:
     """States in the frame at ``origin`` whose x axis has direction ``angle``."""
     heading = states[..., HEADING, None] - angle
     return np.concatenate([_rotated(states[..., :2], origin, angle), heading, states[..., SPEED, None]], axis=-1)

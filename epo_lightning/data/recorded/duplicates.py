@@ -139,7 +139,7 @@ def used_once(
     tables: Mapping[str, SceneTables | None],
     drives: Mapping[str, Drives],
     windows: WindowConfig,
-) -> tuple[dict[str, Bool[np.ndarray, " S"]], dict[str, Counter[str]]]:
+) -> tuple[dict[str, Bool[np.ndarray, " scenes"]], dict[str, Counter[str]]]:
     """The scenes of each recording that are kept, so that the same vehicles at the same moment are in one scene only.
 
     - Of scenes with the same vehicles at the same moment, in two recordings of one split, the first is kept. Moments that
@@ -205,8 +205,11 @@ class _InOrder(Sequence[Drives]):
 
 
 def _windows_overlap(
-    members: Int[np.ndarray, "S N"], time: Float[np.ndarray, " S"], taken: Float[np.ndarray, "n 2"], steps: int
-) -> Bool[np.ndarray, " S"]:
+    members: Int[np.ndarray, "scenes N"],
+    time: Float[np.ndarray, " scenes"],
+    taken: Float[np.ndarray, "n 2"],
+    steps: int,
+) -> Bool[np.ndarray, " scenes"]:
     """Mask of the scenes with a vehicle in ``taken`` (vehicle, t0 in steps) at most ``steps`` before or after their t0."""
     if not len(taken):
         return np.zeros(len(members), dtype=bool)

@@ -25,7 +25,7 @@ RATIO_OF_KIND = 1.75
 """The same ratio for the agents of one kind: recorded speeds of a kind may lag behind (cars of DUT)."""
 SMALL, BETTER = 1.0, 0.5
 """Angle [degrees] from which on other readings of headings are tried, and the share of it that shows a better one."""
-MISREAD: Mapping[str, Callable[[Float[np.ndarray, " S"]], Float[np.ndarray, " S"]]] = {
+MISREAD: Mapping[str, Callable[[Float[np.ndarray, " steps"]], Float[np.ndarray, " steps"]]] = {
     "degrees": np.deg2rad,
     "radians where degrees were expected": np.rad2deg,
     "clockwise": np.negative,
@@ -93,11 +93,11 @@ def doubts(tracks: TrackTable) -> list[str]:
 class _Steps(NamedTuple):
     """Steps from one row of an agent to the next: velocities [m/s] in positions and as stated, and headings [rad]."""
 
-    moved: Float[np.ndarray, "S 2"]
-    stated: Float[np.ndarray, "S 2"]
-    heading: Float[np.ndarray, " S"]
+    moved: Float[np.ndarray, "steps 2"]
+    stated: Float[np.ndarray, "steps 2"]
+    heading: Float[np.ndarray, " steps"]
 
-    def of(self, chosen: Bool[np.ndarray, " S"]) -> _Steps:
+    def of(self, chosen: Bool[np.ndarray, " steps"]) -> _Steps:
         """Some of the steps."""
         return _Steps(*(values[chosen] for values in self))
 
@@ -187,15 +187,15 @@ def _jumps(tracks: TrackTable, same: Bool[np.ndarray, " n"], steps: _Steps) -> l
     ]
 
 
-def _ahead(heading: Float[np.ndarray, " S"]) -> Float[np.ndarray, "S 2"]:
+def _ahead(heading: Float[np.ndarray, " steps"]) -> Float[np.ndarray, "steps 2"]:
     return np.stack((np.cos(heading), np.sin(heading)), -1)
 
 
-def _length(vectors: Float[np.ndarray, "S 2"]) -> Float[np.ndarray, " S"]:
+def _length(vectors: Float[np.ndarray, "steps 2"]) -> Float[np.ndarray, " steps"]:
     return np.asarray(np.linalg.norm(vectors, axis=-1))
 
 
-def _angle(one: Float[np.ndarray, "S 2"], other: Float[np.ndarray, "S 2"]) -> float:
+def _angle(one: Float[np.ndarray, "steps 2"], other: Float[np.ndarray, "steps 2"]) -> float:
     """The median angle between vectors [degrees]."""
     cosine = (one * other).sum(-1) / (_length(one) * _length(other))
     return float(np.degrees(np.median(np.arccos(np.clip(cosine, -1.0, 1.0)))))

@@ -16,8 +16,8 @@ CHUNK = 4096
 
 
 def nearest_pieces(
-    polylines: Float[np.ndarray, "T V+1 2"], centre: Float[np.ndarray, "S 2"], most: int
-) -> Int[np.ndarray, "S L"]:
+    polylines: Float[np.ndarray, "T V+1 2"], centre: Float[np.ndarray, "scenes 2"], most: int
+) -> Int[np.ndarray, "scenes L"]:
     """Indices of the polylines whose middles are nearest to each centre, nearest first; padded with -1."""
     found = np.full((len(centre), most), -1, dtype=np.int32)
     if len(polylines):
@@ -34,9 +34,9 @@ def reachable_pieces(
     polylines: Float[np.ndarray, "T V+1 2"],
     position: Float[np.ndarray, "A 2"],
     far: Float[np.ndarray, " A"],
-    members: Int[np.ndarray, "S N"],
-    centre: Float[np.ndarray, "S 2"],
-) -> Int[np.ndarray, "S L"]:
+    members: Int[np.ndarray, "scenes N"],
+    centre: Float[np.ndarray, "scenes 2"],
+) -> Int[np.ndarray, "scenes L"]:
     """Indices of the polylines with a point within reach of an agent of the scene, nearest to the centre first.
 
     L is the largest number of any scene; the others are padded with -1.

@@ -23,7 +23,7 @@ class SceneTables:
         lines: number of reference lines of each agent, the first ones of ``references``; None if every agent has all.
     Attributes, by lane polyline (T rows):
         polylines: points of the map's polylines.
-    Attributes, by scene (S rows):
+    Attributes, by scene:
         agents: rows of the scene's agents, -1 for none.
         lanes: rows of its polylines, -1 for none.
         centre: mean position of its agents, the origin of its frame [m].
@@ -45,12 +45,12 @@ class SceneTables:
     references: Float[np.ndarray, "A R Q 2"]
     reference_speed: Float[np.ndarray, " A"]
     polylines: Float[np.ndarray, "T V+1 2"]
-    agents: Int[np.ndarray, "S N"]
-    lanes: Int[np.ndarray, "S L"]
-    centre: Float[np.ndarray, "S 2"]
-    direction: Float[np.ndarray, " S"]
-    recording: Int[np.ndarray, " S"]
-    frame: Int[np.ndarray, " S"]
+    agents: Int[np.ndarray, "scenes N"]
+    lanes: Int[np.ndarray, "scenes L"]
+    centre: Float[np.ndarray, "scenes 2"]
+    direction: Float[np.ndarray, " scenes"]
+    recording: Int[np.ndarray, " scenes"]
+    frame: Int[np.ndarray, " scenes"]
     origin: Float[np.ndarray, "O 2"]
     lines: Int[np.ndarray, " A"] | None = None
 
@@ -104,7 +104,7 @@ def joined(parts: Sequence[SceneTables]) -> SceneTables:
     return SceneTables(**{name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]})
 
 
-def selected(tables: SceneTables | None, kept: Bool[np.ndarray, " S"] | None) -> SceneTables | None:
+def selected(tables: SceneTables | None, kept: Bool[np.ndarray, " scenes"] | None) -> SceneTables | None:
     """The tables of some of the scenes, without the agents of the others; None if no scene is kept."""
     if tables is None or kept is None or not kept.any():
         return None

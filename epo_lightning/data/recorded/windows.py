@@ -206,7 +206,9 @@ def _walking(clock: Stretches, recording: Recording) -> Bool[np.ndarray, " Z"]:
     return (recording.tracks.kind == KINDS.index("pedestrian"))[clock.agent][clock.owner]
 
 
-def _rows(clock: Stretches, moments: Int[np.ndarray, " S"], members: Int[np.ndarray, "S N"]) -> Int[np.ndarray, "S N"]:
+def _rows(
+    clock: Stretches, moments: Int[np.ndarray, " scenes"], members: Int[np.ndarray, "scenes N"]
+) -> Int[np.ndarray, "scenes N"]:
     """Rows of the members of windows at their moments; -1 for none."""
     return np.where(members >= 0, clock.start[members] + moments[:, None] - clock.first[members], -1)
 
@@ -217,7 +219,7 @@ def _choose(
     usable: Bool[np.ndarray, " Z"],
     config: WindowConfig,
     counts: Counter[str],
-) -> tuple[Int[np.ndarray, " S"], Int[np.ndarray, "S N"]]:
+) -> tuple[Int[np.ndarray, " scenes"], Int[np.ndarray, "scenes N"]]:
     """Moments and members (stretches) of the selected windows; the focal agent is first, the others follow by distance."""
     found_moments, found_members = [np.empty(0, dtype=int)], [np.empty((0, config.agents), dtype=int)]
     for moment, stretch, focal in _crowds(clock, usable, config, counts):
@@ -288,8 +290,8 @@ def _assemble(
     config: WindowConfig,
     clock: Stretches,
     located: Located,
-    moments: Int[np.ndarray, " S"],
-    members: Int[np.ndarray, "S N"],
+    moments: Int[np.ndarray, " scenes"],
+    members: Int[np.ndarray, "scenes N"],
 ) -> SceneTables:
     """The tables of the selected windows."""
     rows = _rows(clock, moments, members)

@@ -20,7 +20,7 @@ TIE = 1e-6
 
 
 def admissible(solutions: Solutions, constants: GameConstants) -> NDArray[np.bool_]:
-    """Mask [S] of the solutions that may become modes: converged, without contact, without driving backwards."""
+    """Mask [starts] of the solutions that may become modes: converged, without contact, without driving backwards."""
     return solutions.converged & (solutions.distance > DISC_DIAMETER) & (solutions.speed >= constants.speed_min)
 
 

@@ -186,15 +186,15 @@ def solve_feedback(
 
 @dataclass(frozen=True)
 class Solutions:
-    """Solutions from S start strategies.
+    """Solutions from some start strategies.
 
     Attributes:
-        states [S, K+1, 8], controls [S, K, 4]: the trajectories.
-        converged [S]: whether the solver stopped at its tolerance.
-        agent_costs [S, 2], potential [S]: cost of each agent, and the potential.
-        distance [S], rotation [S], speed [S]: smallest distance [m], rotation of the line of sight [rad] and smallest
-            speed [m/s] along the trajectory.
-        iterations [S]: number of iterations.
+        states [starts, K+1, 8], controls [starts, K, 4]: the trajectories.
+        converged [starts]: whether the solver stopped at its tolerance.
+        agent_costs [starts, 2], potential [starts]: cost of each agent, and the potential.
+        distance [starts], rotation [starts], speed [starts]: smallest distance [m], rotation of the line of sight [rad]
+            and smallest speed [m/s] along the trajectory.
+        iterations [starts]: number of iterations.
     """
 
     states: Array
@@ -211,7 +211,7 @@ class Solutions:
 def solve(
     start: Array, starts: Array, constants: Array, goals: Array, weight: float, solver: str = "potential"
 ) -> Solutions:
-    """Solutions of the game with the start state ``start`` [8] from start strategies [S, K, 4].
+    """Solutions of the game with the start state ``start`` [8] from start strategies [starts, K, 4].
 
     The loop over the starts is not compiled, because compiling it would compile both solvers again.
     """

@@ -16,13 +16,13 @@ DEPENDENT = 1e-12
 
 
 class Anderson:
-    """The last points of S iterations, and their deviations."""
+    """The last points of some iterations, and their deviations."""
 
     def __init__(self, iterations: int, depth: int, size: int) -> None:
         """No points yet.
 
         Args:
-            iterations: S, the number of iterations.
+            iterations: number of iterations.
             depth: H, the largest number of points that are remembered.
             size: D, the length of a point.
         """

@@ -21,11 +21,11 @@ from epo_lightning.solvers.gauss_newton.kernel.interface import EpoLQGames, EpoL
 STATE, CONTROL = 4, 2
 """Numbers of an agent's state and control."""
 
-Policies = tuple[Float[Tensor, "S K m n"], Float[Tensor, "S K m"], Bool[Tensor, " S"]]
+Policies = tuple[Float[Tensor, "games K m n"], Float[Tensor, "games K m"], Bool[Tensor, " games"]]
 """Gains, offsets, and a mask of the games whose equilibrium is unique."""
 
 
-def equilibria(parts: Sequence[Tensor], rho: float, free: Bool[Tensor, "S N K"]) -> Policies:
+def equilibria(parts: Sequence[Tensor], rho: float, free: Bool[Tensor, "games N K"]) -> Policies:
     """Feedback Nash equilibria, by the coupled Riccati recursion (Basar and Olsder, Dynamic Noncooperative Game Theory,
     Corollary 6.1).
 
@@ -54,9 +54,9 @@ def equilibria(parts: Sequence[Tensor], rho: float, free: Bool[Tensor, "S N K"])
 def pull_back(
     parts: Sequence[Tensor],
     rho: float,
-    free: Bool[Tensor, "S N K"],
+    free: Bool[Tensor, "games N K"],
     policies: Policies,
-    controls: Float[Tensor, "S K m"],
+    controls: Float[Tensor, "games K m"],
 ) -> tuple[Tensor, ...]:
     """The derivative of <controls, u> by the parts of the games.
 
@@ -81,15 +81,15 @@ def pull_back(
 
 
 def follow(
-    start: Float[Tensor, "S N 4"],
-    states: Float[Tensor, "S N K 4"],
-    controls: Float[Tensor, "S N K 2"],
-    gains: Float[Tensor, "S K m n"],
-    offsets: Float[Tensor, "S K m"],
-    length: Float[Tensor, " S"],
+    start: Float[Tensor, "games N 4"],
+    states: Float[Tensor, "games N K 4"],
+    controls: Float[Tensor, "games N K 2"],
+    gains: Float[Tensor, "games K m n"],
+    offsets: Float[Tensor, "games K m"],
+    length: Float[Tensor, " games"],
     dt: float,
     beta: float,
-) -> tuple[Float[Tensor, "S N K 4"], Float[Tensor, "S N K 2"]]:
+) -> tuple[Float[Tensor, "games N K 4"], Float[Tensor, "games N K 2"]]:
     """States and controls of unicycles that follow policies around given trajectories.
 
     Args:

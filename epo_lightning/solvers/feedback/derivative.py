@@ -70,7 +70,7 @@ class _Attach(torch.autograd.Function):
         return None, None, None, None, *(next(found) if tensor.requires_grad else None for tensor in tensors)
 
 
-def _gmres(by_controls: Callable[[Tensor], Tensor], cotangent: Tensor, steps: int) -> Float[Tensor, "S 1 N K 2"]:
+def _gmres(by_controls: Callable[[Tensor], Tensor], cotangent: Tensor, steps: int) -> Float[Tensor, "games 1 N K 2"]:
     """The solution y of -D_u' y = v for a cotangent v, where ``by_controls`` multiplies by D_u'.
 
     Of all sums of v, D_u' v, D_u' D_u' v, ..., y is the one with the least residual (Saad and Schultz, "GMRES", SIAM Journal

@@ -52,7 +52,7 @@ class FeedbackGame:
     rho: float
 
     def one_by_one(self, modes: int) -> FeedbackGame:
-        """The S = B M games as S scenes with one mode each."""
+        """The B M games as B M scenes with one mode each."""
         scenes = torch.arange(len(self.scene.history)).repeat_interleave(modes)
         parameters = games(self.parameters, scenes, torch.arange(modes).repeat(len(self.scene.history)))
         return dataclasses.replace(self, scene=self.scene[scenes], parameters=parameters)
@@ -70,7 +70,7 @@ class FeedbackGame:
         return self.energy.dynamics.rollout(self.energy.current_states(self.scene), controls, self.scene.dt)
 
     def follow(
-        self, states: Tensor, controls: Tensor, policy: Policy, length: Float[Tensor, " S"]
+        self, states: Tensor, controls: Tensor, policy: Policy, length: Float[Tensor, " games"]
     ) -> tuple[Float[Tensor, "B M N K 4"], Float[Tensor, "B M N K 2"]]:
         """States and controls of agents that follow the policies around trajectories, each with its step length."""
         start = self.energy.current_states(self.scene).expand_as(states[..., 0, :])
@@ -131,7 +131,7 @@ def iterate(
 
 @dataclass(frozen=True)
 class _Step:
-    """A step of S games.
+    """A step of some games.
 
     Attributes:
         states, controls: the next trajectories.
@@ -140,14 +140,14 @@ class _Step:
         usable: mask of the games that have a next trajectory; the others stay where they are.
     """
 
-    states: Float[Tensor, "S 1 N K 4"]
-    controls: Float[Tensor, "S 1 N K 2"]
-    deviations: Float[Tensor, "S 1 N K 2"]
-    wanted: Float[Tensor, " S"]
-    usable: Bool[Tensor, " S"]
+    states: Float[Tensor, "games 1 N K 4"]
+    controls: Float[Tensor, "games 1 N K 2"]
+    deviations: Float[Tensor, "games 1 N K 2"]
+    wanted: Float[Tensor, " games"]
+    usable: Bool[Tensor, " games"]
 
 
-def _step(game: FeedbackGame, states: Tensor, controls: Tensor, length: Float[Tensor, " S"]) -> _Step:
+def _step(game: FeedbackGame, states: Tensor, controls: Tensor, length: Float[Tensor, " games"]) -> _Step:
     """The step that the policies of the LQ games suggest, halved until it changes no state by too much."""
     policy = game.linearised(states, controls).equilibrium()
     for _ in range(TRIALS):
@@ -166,7 +166,7 @@ def _step(game: FeedbackGame, states: Tensor, controls: Tensor, length: Float[Te
 
 def _guarded(
     game: FeedbackGame, states: Tensor, step: _Step, guess: Tensor
-) -> tuple[Float[Tensor, "S 1 N K 4"], Float[Tensor, "S 1 N K 2"]]:
+) -> tuple[Float[Tensor, "games 1 N K 4"], Float[Tensor, "games 1 N K 2"]]:
     """The trajectories of guessed controls, and those of the step where these are too far."""
     guessed = game.states(guess)
     near = (game.change(states, guessed) <= LARGEST_MOVE)[:, None, None, None, None]

@@ -13,7 +13,7 @@ equilibrium the agents have affine policies u_k = G_k x_k + f_k: each is the bes
 every state. So an agent counts on the reactions of the others; in an open-loop equilibrium
 (:mod:`~epo_lightning.solvers.gauss_newton`) it takes their controls as given.
 
-Letters: S games, n = 4 N joint states, m = 2 N joint controls. Matrices with one more column hold a matrix and a vector:
+Letters: n = 4 N joint states, m = 2 N joint controls. Matrices with one more column hold a matrix and a vector:
 [Q | q] for a cost, [G | f] for a policy.
 """
 
@@ -31,7 +31,7 @@ from epo_lightning.solvers.feedback import compiled
 
 @dataclass(frozen=True)
 class LQGame:
-    """S linear-quadratic games.
+    """Linear-quadratic games.
 
     Attributes:
         A, B: the dynamics of every agent.
@@ -42,14 +42,14 @@ class LQGame:
         free: mask of the controls that are chosen; policies leave the others as they are, such as those after the end.
     """
 
-    A: Float[Tensor, "S N K 4 4"]
-    B: Float[Tensor, "S N K 4 2"]
-    own_cost: Float[Tensor, "S N K 4 5"]
-    pair_cost: Float[Tensor, "S P K 8 9"]
-    effort: Float[Tensor, "S N K 2 2"]
-    push: Float[Tensor, "S N K 2"]
+    A: Float[Tensor, "games N K 4 4"]
+    B: Float[Tensor, "games N K 4 2"]
+    own_cost: Float[Tensor, "games N K 4 5"]
+    pair_cost: Float[Tensor, "games P K 8 9"]
+    effort: Float[Tensor, "games N K 2 2"]
+    push: Float[Tensor, "games N K 2"]
     rho: float
-    free: Bool[Tensor, "S N K"]
+    free: Bool[Tensor, "games N K"]
 
     def equilibrium(self) -> Policy:
         """The feedback Nash equilibrium, without a derivative.
@@ -60,7 +60,7 @@ class LQGame:
         return Policy(*compiled.equilibria(self._parts(), self.rho, self.free))
 
     def pull_back(
-        self, policy: Policy, cotangent: Float[Tensor, "S N K 2"], inputs: Sequence[Tensor]
+        self, policy: Policy, cotangent: Float[Tensor, "games N K 2"], inputs: Sequence[Tensor]
     ) -> tuple[Tensor, ...]:
         """The derivative of <cotangent, u> by ``inputs``, tensors from which the game was computed.
 
@@ -89,6 +89,6 @@ class Policy:
         unique: mask of the games whose equilibrium is unique, so that the policies are it.
     """
 
-    gains: Float[Tensor, "S K m n"]
-    offsets: Float[Tensor, "S K m"]
-    unique: Bool[Tensor, " S"]
+    gains: Float[Tensor, "games K m n"]
+    offsets: Float[Tensor, "games K m"]
+    unique: Bool[Tensor, " games"]

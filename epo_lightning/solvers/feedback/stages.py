@@ -37,7 +37,7 @@ def lq_game(
     controls: Float[Tensor, "B M N K 2"],
     rho: float,
 ) -> LQGame:
-    """The linear-quadratic games around joint trajectories, one per scene and mode: S = B M. Differentiable.
+    """The linear-quadratic games around joint trajectories, one per scene and mode, `games` = B M. Differentiable.
 
     Args:
         energy, scene, parameters: the game.

@@ -104,7 +104,7 @@ def _times(matrix: Float[Tensor, "C a b"], vector: Float[Tensor, "C b 1"]) -> Fl
 
 
 def factorise(
-    model: QuadraticModel, damping: Float[Tensor, " S *agents"], group: Group
+    model: QuadraticModel, damping: Float[Tensor, " problems *agents"], group: Group
 ) -> tuple[Factors, Bool[Tensor, " C"]]:
     """Factors of a group's matrices, and a mask of those that are not positive definite.
 
@@ -129,7 +129,7 @@ def factorise(
 class _Parts:
     """The stiffness of a model for one group, laid out [C, .., nodes, .., m]."""
 
-    def __init__(self, model: QuadraticModel, damping: Float[Tensor, " S *agents"], group: Group) -> None:
+    def __init__(self, model: QuadraticModel, damping: Float[Tensor, " problems *agents"], group: Group) -> None:
         self.model, self.group, self.size = model, group, group.size
 
         # Double precision is needed: rates of controls enter the nodes divided by dt^4.

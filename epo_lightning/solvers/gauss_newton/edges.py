@@ -16,12 +16,12 @@ from epo_lightning.scene import Scene
 
 @dataclass(frozen=True)
 class Edges:
-    """A list of pairs of agents of all problems; agent i of problem s has the number s N + i, pair p the number s P + p.
+    """A list of pairs of agents of all problems; agent i of problem b has the number b N + i, pair p the number b P + p.
 
     Attributes:
         first, second: numbers s N + i and s N + j of the agents.
         pair: number s P + p of the pair.
-        problems, agents: S and N.
+        problems, agents: numbers of problems and of their agents.
         every: whether these are all pairs, in order.
     """
 
@@ -82,17 +82,19 @@ class Edges:
         """The values of these edges, from those of all pairs of all problems."""
         return values if self.every else values.index_select(0, self.pair)
 
-    def ends(self, values: Float[Tensor, "S N *rest"]) -> tuple[Float[Tensor, " E *rest"], Float[Tensor, " E *rest"]]:
+    def ends(
+        self, values: Float[Tensor, "problems N *rest"]
+    ) -> tuple[Float[Tensor, " E *rest"], Float[Tensor, " E *rest"]]:
         """The values of the first and of the second agent of every edge."""
         flat = values.flatten(0, 1)
         return flat.index_select(0, self.first), flat.index_select(0, self.second)
 
-    def difference(self, values: Float[Tensor, "S N *rest"]) -> Float[Tensor, " E *rest"]:
+    def difference(self, values: Float[Tensor, "problems N *rest"]) -> Float[Tensor, " E *rest"]:
         """The first agent's value minus the second's."""
         first, second = self.ends(values)
         return first.sub_(second)
 
-    def spread_(self, onto: Float[Tensor, "S N *rest"], first: Tensor, second: Tensor) -> None:
+    def spread_(self, onto: Float[Tensor, "problems N *rest"], first: Tensor, second: Tensor) -> None:
         """Add values of edges to their first and second agents, in place.
 
         On a CPU values are added edge by edge, so that sums do not depend on the rest of the batch. On other devices, if all
@@ -112,7 +114,7 @@ class Group:
     """C sets of m agents whose matrices are assembled together.
 
     Attributes:
-        agents: numbers s N + i of the agents; None for all agents of all problems, in order.
+        agents: numbers b N + i of the agents; None for all agents of all problems, in order.
         count, size: C and m.
         edges: indices of the edges within the sets; None for all edges.
         component, first, second: index of the set of each edge, and indices of both agents within the set.

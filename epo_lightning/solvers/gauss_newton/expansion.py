@@ -112,7 +112,7 @@ def expand(
     )
 
 
-def _add_own(sums: Sums, feature: OwnFeature, weight: Float[Tensor, "S N 1"]) -> OwnTerm:
+def _add_own(sums: Sums, feature: OwnFeature, weight: Float[Tensor, "problems N 1"]) -> OwnTerm:
     """Add a declared own feature."""
     match feature.source:
         case Source.STEERING:
@@ -128,7 +128,7 @@ def _add_own(sums: Sums, feature: OwnFeature, weight: Float[Tensor, "S N 1"]) ->
 
 
 def _bounds(at: Iterate, feature: OwnFeature) -> Bounds:
-    """Bounds of a feature's signal, for every problem where they depend on the kind of agent: [S, N, 1]."""
+    """Bounds of a feature's signal, for every problem where they depend on the kind of agent: [problems, N, 1]."""
     if not feature.bounded or feature.signal not in at.energy.bounded_by_kind:
         return at.around.bounds
     both = [torch.as_tensor(bound) for bound in at.around.bounds[feature.signal]]
@@ -136,7 +136,7 @@ def _bounds(at: Iterate, feature: OwnFeature) -> Bounds:
     return {feature.signal: (lower, upper)}
 
 
-def _add_signal(sums: Sums, feature: OwnFeature, weight: Float[Tensor, "S N 1"]) -> SignalTerm:
+def _add_signal(sums: Sums, feature: OwnFeature, weight: Float[Tensor, "problems N 1"]) -> SignalTerm:
     at, square = sums.at, weight.square()
     signal = linear_signal(feature, at.u, at.speed, at.dt, channels=-2)
     if feature.needs:
@@ -166,7 +166,7 @@ def _add_signal(sums: Sums, feature: OwnFeature, weight: Float[Tensor, "S N 1"])
     return SignalTerm(feature, weight, c)
 
 
-def _add_steering(sums: Sums, weight: Float[Tensor, "S N 1"]) -> SteeringTerm:
+def _add_steering(sums: Sums, weight: Float[Tensor, "problems N 1"]) -> SteeringTerm:
     at, square = sums.at, weight.square()
     angle, by_turn_rate, by_speed = steering(*at.steered())
     if at.within_game is not None:
@@ -191,7 +191,7 @@ def _add_steering(sums: Sums, weight: Float[Tensor, "S N 1"]) -> SteeringTerm:
     return SteeringTerm(weight, angle, by_turn_rate, by_speed)
 
 
-def _add_lane(sums: Sums, weight: Float[Tensor, "S N 1"]) -> LaneTerm:
+def _add_lane(sums: Sums, weight: Float[Tensor, "problems N 1"]) -> LaneTerm:
     at = sums.at
     assert at.around.line is not None
     position = at.states[..., :2]
@@ -209,7 +209,7 @@ def _add_lane(sums: Sums, weight: Float[Tensor, "S N 1"]) -> LaneTerm:
     return LaneTerm(weight, offset, tangent)
 
 
-def _add_goal(sums: Sums, weight: Float[Tensor, "S N 1"]) -> GoalTerm:
+def _add_goal(sums: Sums, weight: Float[Tensor, "problems N 1"]) -> GoalTerm:
     at, square = sums.at, weight.square()
     assert at.around.goals is not None
     offset = at.last(at.x[:, :, :2]) - at.around.goals.flatten(0, 1)
@@ -220,7 +220,7 @@ def _add_goal(sums: Sums, weight: Float[Tensor, "S N 1"]) -> GoalTerm:
     return GoalTerm(weight, offset)
 
 
-def _add_heading(sums: Sums, weight: Float[Tensor, "S N 1"]) -> HeadingTerm:
+def _add_heading(sums: Sums, weight: Float[Tensor, "problems N 1"]) -> HeadingTerm:
     at, square = sums.at, weight.square()
     offset = at.last(at.x[:, :, HEADING, None]) - at.by_problem(at.around.goal_headings)
     scaled = square * offset
@@ -267,7 +267,9 @@ def _set_undeclared_hessian(sums: Sums, edges: Edges) -> None:
             )
     hessian = torch.stack([torch.zeros_like(controls) if row is None else row for row in rows])
     hessian = hessian.flatten(1, 2).view(at.agents, at.horizon, 2, at.problems, at.agents, at.horizon, 2)
-    at_nodes = at.to_nodes(at.to_nodes(hessian.permute(3, 0, 2, 4, 6, 5, 1)).transpose(-1, -2))  # [S i c j d k l]
+    at_nodes = at.to_nodes(
+        at.to_nodes(hessian.permute(3, 0, 2, 4, 6, 5, 1)).transpose(-1, -2)
+    )  # [problems i c j d k l]
     at_nodes = at_nodes.permute(0, 1, 3, 2, 5, 4, 6)
     at_nodes = at_nodes.reshape(at.problems, at.agents, at.agents, 2 * at.horizon, 2 * at.horizon)
     sums.own_dense = at_nodes.diagonal(dim1=1, dim2=2).movedim(-1, 1)

@@ -7,7 +7,7 @@ left, a position changes as
 
     dp_k = dt sum_{l<k} M_l dz_l,   M_l = [e_l, v_l e'_l]     (explicit Euler; other integrators include l = k).
 
-Arrays are laid out [S, N, component, K] with S problems. Component 0 is speed (of z) or acceleration (of u), component
+Arrays are laid out [problems, N, component, K]. Component 0 is speed (of z) or acceleration (of u), component
 1 is heading or turn rate. (The kernel and `docs/layer.md` have heading first, and their M_l contains the factor dt.)
 """
 
@@ -46,7 +46,7 @@ class Iterate:
         around: inputs of the own features besides the trajectory.
         u, x: controls and states, by problem.
         unit, left: unit vectors of the headings, and those to their left.
-        moves: M_l, laid out [S, N, component, axis, K]: the derivatives of velocities (x, y) by speed and by heading.
+        moves: M_l, laid out [problems, N, component, axis, K]: the derivatives of velocities (x, y) by speed and by heading.
     """
 
     energy: FeatureEnergy
@@ -55,11 +55,11 @@ class Iterate:
     controls: Float[Tensor, "B M N K 2"]
     states: Float[Tensor, "B M N K 4"]
     around: Surroundings
-    u: Float[Tensor, "S N 2 K"]
-    x: Float[Tensor, "S N 4 K"]
-    unit: Float[Tensor, "S N 2 K"]
-    left: Float[Tensor, "S N 2 K"]
-    moves: Float[Tensor, "S N 2 2 K"]
+    u: Float[Tensor, "problems N 2 K"]
+    x: Float[Tensor, "problems N 4 K"]
+    unit: Float[Tensor, "problems N 2 K"]
+    left: Float[Tensor, "problems N 2 K"]
+    moves: Float[Tensor, "problems N 2 2 K"]
 
     @classmethod
     def of(cls, energy: FeatureEnergy, scene: Scene, parameters: GameParameters, controls: Tensor) -> Iterate:
@@ -76,7 +76,7 @@ class Iterate:
 
     @property
     def problems(self) -> int:
-        """Number S = B M of problems."""
+        """Number B M of problems."""
         return self.u.shape[0]
 
     @property
@@ -105,12 +105,12 @@ class Iterate:
         return self.energy.dynamics.beta
 
     @property
-    def speed(self) -> Float[Tensor, "S N K"]:
+    def speed(self) -> Float[Tensor, "problems N K"]:
         """Speeds at the nodes 1 .. K."""
         return self.x[:, :, SPEED]
 
     @cached_property
-    def within_game(self) -> Bool[Tensor, "S 1 1 K"] | None:
+    def within_game(self) -> Bool[Tensor, "problems 1 1 K"] | None:
         """Mask of the steps of each game (``scene.game_steps``); None if all games have K steps."""
         if self.around.ends is None:
             return None
@@ -118,7 +118,7 @@ class Iterate:
         return torch.arange(self.horizon, device=ends.device) < ends
 
     @cached_property
-    def _last(self) -> Bool[Tensor, "S 1 1 K"] | None:
+    def _last(self) -> Bool[Tensor, "problems 1 1 K"] | None:
         """Mask of the last step of each game; None if all games have K steps."""
         return (
             None
@@ -126,11 +126,11 @@ class Iterate:
             else self.within_game & (self.within_game.cumsum(-1) == self.within_game.sum(-1, keepdim=True))
         )
 
-    def last(self, values: Float[Tensor, "S N c K"]) -> Float[Tensor, "S N c"]:
+    def last(self, values: Float[Tensor, "problems N c K"]) -> Float[Tensor, "problems N c"]:
         """The entries of the last step of every game."""
         return values[..., -1] if self._last is None else values.where(self._last, 0.0).sum(-1)
 
-    def add_last_(self, onto: Float[Tensor, "S N c K"], values: Float[Tensor, "S N #c"]) -> None:
+    def add_last_(self, onto: Float[Tensor, "problems N c K"], values: Float[Tensor, "problems N #c"]) -> None:
         """Add values to the entries of the last step of every game, in place."""
         if self._last is None:
             onto[..., -1] += values
@@ -138,11 +138,11 @@ class Iterate:
             onto += self._last * values[..., None]
 
     @property
-    def present(self) -> Bool[Tensor, "S N"]:
+    def present(self) -> Bool[Tensor, "problems N"]:
         """Mask of the present agents."""
         return self.by_problem(self.scene.agent_mask[:, None])[..., 0]
 
-    def by_problem(self, values: Tensor | None) -> Float[Tensor, "S N 1"] | Bool[Tensor, "S N 1"]:
+    def by_problem(self, values: Tensor | None) -> Float[Tensor, "problems N 1"] | Bool[Tensor, "problems N 1"]:
         """Values [B, 1 or M, N] of agents, by problem."""
         assert values is not None
         return values.expand(values.shape[0], self.modes, self.agents).reshape(self.problems, self.agents, 1)

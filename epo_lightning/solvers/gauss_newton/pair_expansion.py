@@ -85,7 +85,7 @@ def add_undeclared_pair(sums: Sums, edges: Edges, feature: PairFeature, name: st
     at, energy = sums.at, sums.at.energy
     both = edges.ends(energy.at_pair_steps(at.states.flatten(0, 1)))
     moved = energy.dynamics.tangent(at.states, at.node_directions(), at.dt).flatten(1, 2)
-    moved = energy.at_pair_steps(moved).permute(1, 2, 0, 3, 4)  # [S, N, 2 K, L, 4]
+    moved = energy.at_pair_steps(moved).permute(1, 2, 0, 3, 4)  # [problems, N, 2 K, L, 4]
     first, second = (side.transpose(0, 1) for side in edges.ends(moved))
     others: tuple[Tensor, ...] = ()
     if feature.needs:

@@ -43,22 +43,22 @@ class Gradients:
         reference_controls: gradient by the reference controls; None without a feature that needs them.
     """
 
-    controls: Float[Tensor, "S N 2 K"]
-    own: dict[str, Float[Tensor, "S N"]]
-    pair: dict[str, Float[Tensor, "S P"]]
-    goals: Float[Tensor, "S N 2"] | None
-    goal_headings: Float[Tensor, "S N"] | None
-    margins: dict[str, Float[Tensor, "S P"]]
-    reference_controls: Float[Tensor, "S N K 2"] | None
+    controls: Float[Tensor, "problems N 2 K"]
+    own: dict[str, Float[Tensor, "problems N"]]
+    pair: dict[str, Float[Tensor, "problems P"]]
+    goals: Float[Tensor, "problems N 2"] | None
+    goal_headings: Float[Tensor, "problems N"] | None
+    margins: dict[str, Float[Tensor, "problems P"]]
+    reference_controls: Float[Tensor, "problems N K 2"] | None
 
 
 @dataclass(frozen=True)
 class _Changes:
     """Changes along mu and d, stacked in the first dimension: of controls, nodes and positions."""
 
-    controls: Float[Tensor, "2 S N 2 K"]
-    nodes: Float[Tensor, "2 S N 2 K"]
-    positions: Float[Tensor, "2 S N 2 K"]
+    controls: Float[Tensor, "2 problems N 2 K"]
+    nodes: Float[Tensor, "2 problems N 2 K"]
+    positions: Float[Tensor, "2 problems N 2 K"]
 
 
 @dataclass(frozen=True)
@@ -71,12 +71,14 @@ class _Sums:
             their change along d.
     """
 
-    controls: Float[Tensor, "S N 2 K"]
-    nodes: Float[Tensor, "S N 2 K"]
-    positions: Float[Tensor, "S N 3 2 K"]
+    controls: Float[Tensor, "problems N 2 K"]
+    nodes: Float[Tensor, "problems N 2 K"]
+    positions: Float[Tensor, "problems N 3 2 K"]
 
 
-def pullback(model: QuadraticModel, adjoint: Float[Tensor, "S N 2 K"], step: Float[Tensor, "S N 2 K"]) -> Gradients:
+def pullback(
+    model: QuadraticModel, adjoint: Float[Tensor, "problems N 2 K"], step: Float[Tensor, "problems N 2 K"]
+) -> Gradients:
     """The gradient of phi = -<J mu, r + J d> for constant changes mu (``adjoint``) and d (``step``) of the controls."""
     at, dt = model.at, model.at.dt
     controls = torch.stack((adjoint, step))
@@ -107,8 +109,10 @@ def pullback(model: QuadraticModel, adjoint: Float[Tensor, "S N 2 K"], step: Flo
         own[name] = -2.0 * term.weight[..., 0] * (along_mu * ahead).flatten(2).sum(-1)
     pair, margins = _pull_pairs(model, changes, sums)
     after = at.to_velocities(sums.positions)
-    along_e, along_left = ((direction[:, :, None] * after).sum(3) for direction in (at.unit, at.left))  # [S, N, 3, K]
-    faster, turned = nodes.movedim(0, 2).unbind(3)  # [S, N, 2, K]
+    along_e, along_left = (
+        (direction[:, :, None] * after).sum(3) for direction in (at.unit, at.left)
+    )  # [problems, N, 3, K]
+    faster, turned = nodes.movedim(0, 2).unbind(3)  # [problems, N, 2, K]
     # Entry 0 acts through the velocities, entries 1 and 2 through their changes along mu and d, which are
     # (change of v) e + v (change of theta) e'.
     node = sums.nodes
@@ -192,7 +196,7 @@ def _pull_goal(model: QuadraticModel, term: GoalTerm, changes: _Changes, sums: _
 
 def _pull_pairs(
     model: QuadraticModel, changes: _Changes, sums: _Sums
-) -> tuple[dict[str, Float[Tensor, "S P"]], dict[str, Float[Tensor, "S P"]]]:
+) -> tuple[dict[str, Float[Tensor, "problems P"]], dict[str, Float[Tensor, "problems P"]]]:
     """Adds the derivatives of the declared pair features; returns the gradients by their weights and by their margins."""
     by_weight: dict[str, Tensor] = {}
     by_margin: dict[str, Tensor] = {}
@@ -231,7 +235,7 @@ def _pull_pairs(
     return by_weight, by_margin
 
 
-def _of_all_pairs(model: QuadraticModel, values: Float[Tensor, " E"]) -> Float[Tensor, "S P"]:
+def _of_all_pairs(model: QuadraticModel, values: Float[Tensor, " E"]) -> Float[Tensor, "problems P"]:
     """Values of edges as values of all pairs, zero for pairs that are no edge."""
     at, edges = model.at, model.edges
     if not edges.every:

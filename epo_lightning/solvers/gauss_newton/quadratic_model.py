@@ -11,7 +11,7 @@ contributions are banded matrices: controls are first differences of z, their ra
 the diagonal, and a steering angle couples a turn rate with the speed before it. The model holds the second derivatives by
 these quantities; :mod:`~epo_lightning.solvers.gauss_newton.blocks` assembles and factorises the matrix.
 
-Pairs are a list of E edges between agents. Agent i of problem s has the number s N + i.
+Pairs are a list of E edges between agents. Agent i of problem b has the number b N + i.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class SignalTerm:
     """A feature of a control, its rate or the speed: c(s) with derivatives."""
 
     feature: OwnFeature
-    weight: Float[Tensor, "S N 1"]
+    weight: Float[Tensor, "problems N 1"]
     c: Derivatives
 
 
@@ -41,35 +41,35 @@ class SignalTerm:
 class SteeringTerm:
     """The steering angle, with its derivatives by the turn rate and by the speed before it."""
 
-    weight: Float[Tensor, "S N 1"]
-    angle: Float[Tensor, "S N K"]
-    by_turn_rate: Float[Tensor, "S N K"]
-    by_speed: Float[Tensor, "S N K"]
+    weight: Float[Tensor, "problems N 1"]
+    angle: Float[Tensor, "problems N K"]
+    by_turn_rate: Float[Tensor, "problems N K"]
+    by_speed: Float[Tensor, "problems N K"]
 
 
 @dataclass(frozen=True)
 class LaneTerm:
     """The offset from the nearest point of a line, and the unit tangent there, which is zero at the ends of segments."""
 
-    weight: Float[Tensor, "S N 1"]
-    offset: Float[Tensor, "S N 2 K"]
-    tangent: Float[Tensor, "S N 2 K"]
+    weight: Float[Tensor, "problems N 1"]
+    offset: Float[Tensor, "problems N 2 K"]
+    tangent: Float[Tensor, "problems N 2 K"]
 
 
 @dataclass(frozen=True)
 class GoalTerm:
     """The offset of the last position from the goal."""
 
-    weight: Float[Tensor, "S N 1"]
-    offset: Float[Tensor, "S N 2"]
+    weight: Float[Tensor, "problems N 1"]
+    offset: Float[Tensor, "problems N 2"]
 
 
 @dataclass(frozen=True)
 class HeadingTerm:
     """The last heading minus the one that is wanted at the goal."""
 
-    weight: Float[Tensor, "S N 1"]
-    offset: Float[Tensor, "S N 1"]
+    weight: Float[Tensor, "problems N 1"]
+    offset: Float[Tensor, "problems N 1"]
 
 
 OwnTerm = SignalTerm | SteeringTerm | LaneTerm | GoalTerm | HeadingTerm
@@ -140,14 +140,14 @@ class QuadraticModel:
     """
 
     at: Iterate
-    value: Float[Tensor, " S"]
-    gradient: Float[Tensor, "S N 2 K"]
-    control: Float[Tensor, "S N 2 K"]
-    rate: Float[Tensor, "S N 2 K"] | None
-    node: Float[Tensor, "S N 2 K"]
-    cross: Float[Tensor, "S N 2 K"] | None
-    position: Float[Tensor, "S N 3 K"]
-    own_dense: Float[Tensor, "S N D D"] | None
+    value: Float[Tensor, " problems"]
+    gradient: Float[Tensor, "problems N 2 K"]
+    control: Float[Tensor, "problems N 2 K"]
+    rate: Float[Tensor, "problems N 2 K"] | None
+    node: Float[Tensor, "problems N 2 K"]
+    cross: Float[Tensor, "problems N 2 K"] | None
+    position: Float[Tensor, "problems N 3 K"]
+    own_dense: Float[Tensor, "problems N D D"] | None
     edges: Edges
     linked: Bool[Tensor, " E"]
     pair_position: Float[Tensor, "E 3 K"] | None

@@ -2,8 +2,8 @@
 
 One step solves (J^T J + lambda I) d = -J^T r and moves u to u + alpha d. Read this module in this order: :func:`solve` takes
 the steps, :class:`_Step` is one step with its adjoint, :func:`factorise` prepares the solution for d. The matrix is
-factorised in other unknowns than u, the *nodes*: speed and heading after every step (:mod:`.iterate`). Shapes: S problems
-(a scene in a mode), N agents, K steps, E pairs that are evaluated, C components of one size.
+factorised in other unknowns than u, the *nodes*: speed and heading after every step (:mod:`.iterate`). In shapes, a
+problem is the game of one scene in one mode, E pairs are evaluated, and C components have one size.
 
 *Splitting.* Two agents are coupled if a pair feature of theirs is not zero; agents that no such pairs connect are
 independent. On a CPU every problem is split into the connected components of its coupled pairs, and components of the same
@@ -115,7 +115,7 @@ class Game:
     scene: Scene
     parameters: GameParameters
     step_size: float
-    damping: Float[Tensor, " S *agents"]
+    damping: Float[Tensor, " problems *agents"]
     split: bool
     exact: bool = False
 
@@ -221,10 +221,10 @@ class Factorisation:
     model: QuadraticModel
     groups: list[Group]
     factors: list[blocks.Factors]
-    status: Int[Tensor, " S"]
-    held: Bool[Tensor, "S N"] | None = None
+    status: Int[Tensor, " problems"]
+    held: Bool[Tensor, "problems N"] | None = None
 
-    def solve(self, right: Float[Tensor, "S N 2 K"]) -> Float[Tensor, "S N 2 K"]:
+    def solve(self, right: Float[Tensor, "problems N 2 K"]) -> Float[Tensor, "problems N 2 K"]:
         """(J^T J + lambda I)^-1 times a covector of the controls; zero for controls after the end of a game."""
         active = self.model.at.within_game
         if active is not None:
@@ -238,7 +238,7 @@ class Factorisation:
 
 
 def factorise(
-    model: QuadraticModel, damping: Float[Tensor, " S *agents"], split: bool, retry: bool | None = None
+    model: QuadraticModel, damping: Float[Tensor, " problems *agents"], split: bool, retry: bool | None = None
 ) -> Factorisation:
     """Factorise the matrices of all problems; if problems are split, the matrix of each component separately.
 
@@ -273,7 +273,7 @@ def factorise(
 
 def _retry(
     model: QuadraticModel,
-    damping: Float[Tensor, " S *agents"],
+    damping: Float[Tensor, " problems *agents"],
     group: Group,
     factors: blocks.Factors,
     outcome: Int[Tensor, " C"],
@@ -290,7 +290,7 @@ def _retry(
         outcome[where[~failed]] = Status.DAMPED
 
 
-def _components(model: QuadraticModel, held: Bool[Tensor, "S N"] | None = None) -> list[Group]:
+def _components(model: QuadraticModel, held: Bool[Tensor, "problems N"] | None = None) -> list[Group]:
     """The connected components of coupled pairs in every problem; absent and held agents are in no group."""
     edges = model.edges
     problems, agents = edges.problems, edges.agents
@@ -344,18 +344,18 @@ def _components(model: QuadraticModel, held: Bool[Tensor, "S N"] | None = None) 
     return groups
 
 
-def planar(controls: Float[Tensor, "B M N K 2"]) -> Float[Tensor, "S N 2 K"]:
+def planar(controls: Float[Tensor, "B M N K 2"]) -> Float[Tensor, "problems N 2 K"]:
     """Controls in the layout of the quadratic model."""
     return controls.flatten(0, 1).transpose(-1, -2).contiguous()
 
 
-def _gather(group: Group, values: Float[Tensor, "S N 2 K"]) -> Float[Tensor, "C n"]:
+def _gather(group: Group, values: Float[Tensor, "problems N 2 K"]) -> Float[Tensor, "C n"]:
     """Vectors of problems in the order of a group's unknowns."""
     by_agent = values if group.agents is None else values.flatten(0, 1)[group.agents]
     return by_agent.permute(0, 3, 2, 1).reshape(group.count, -1)
 
 
-def _scatter(groups: Sequence[Group], parts: Sequence[Tensor], like: Float[Tensor, "S N 2 K"]) -> Tensor:
+def _scatter(groups: Sequence[Group], parts: Sequence[Tensor], like: Float[Tensor, "problems N 2 K"]) -> Tensor:
     """Vectors [C, n] of groups in the layout of problems, zero for agents that are in no group."""
     steps = like.shape[-1]
     rows = torch.zeros_like(like).flatten(0, 1)
