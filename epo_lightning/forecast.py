@@ -167,7 +167,7 @@ class Equilibrium(Batch):
     """Distance of a forecast's most likely joint mode from an open-loop Nash equilibrium of its game.
 
     Attributes:
-        initial, energy: E at the strategies from which the solver started, and at the forecast.
+        initial_energy, energy: E at the strategies from which the solver started, and at the forecast.
         optimum: E at the local minimum that a descent from the forecast reaches; never above ``energy``. NaN if the
             energy, or one agent's objective, was still falling when its descent ended: energies that are networks may
             have no minimum.
@@ -178,7 +178,7 @@ class Equilibrium(Batch):
             sums of squares: their zero is arbitrary, so a gap relative to it means nothing.
     """
 
-    initial: Float[Tensor, " B"]
+    initial_energy: Float[Tensor, " B"]
     energy: Float[Tensor, " B"]
     optimum: Float[Tensor, " B"]
     gradient_norm: Float[Tensor, " B"]

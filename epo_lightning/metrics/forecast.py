@@ -239,7 +239,7 @@ def equilibrium_values(forecast: JointForecast) -> dict[str, Float[Tensor, " B"]
     if found is None:
         return {}
     values = {
-        "energy_initial": found.initial,
+        "energy_initial": found.initial_energy,
         "energy_solved": found.energy,
         "energy_optimum": found.optimum,
         "gradient_norm": found.gradient_norm,

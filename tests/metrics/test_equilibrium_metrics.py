@@ -20,7 +20,7 @@ def found(scenes: int = 4, agents: int = 3) -> Equilibrium:
         return torch.rand(*shape, dtype=torch.float64)
 
     return Equilibrium(
-        initial=3.0 + uniform(scenes),
+        initial_energy=3.0 + uniform(scenes),
         energy=2.0 + uniform(scenes),
         optimum=1.0 + uniform(scenes),
         gradient_norm=uniform(scenes),
@@ -45,7 +45,7 @@ def test_equilibrium_scores_are_means_over_all_scenes_without_subsets() -> None:
     assert not [name for name in result if "/" in name and name.split("/")[1] in EQUILIBRIUM_METRICS]
     assert {f"odd/{name}" for name in METRICS} < set(result)
     for name, values in (
-        ("energy_initial", report.initial),
+        ("energy_initial", report.initial_energy),
         ("energy_solved", report.energy),
         ("energy_optimum", report.optimum),
         ("gradient_norm", report.gradient_norm),

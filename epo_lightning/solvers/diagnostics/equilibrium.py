@@ -119,7 +119,7 @@ def _smooth(
     lost = torch.zeros_like(scene.agent_mask).index_put((origin, agent), ~(stayed.found & moved.found))
     lost = lost.any(1) | ~optimum.found
     return Equilibrium(
-        initial=initial,
+        initial_energy=initial,
         energy=optimum.before,
         optimum=torch.where(lost, torch.nan, optimum.after),
         gradient_norm=optimum.slope,
@@ -229,7 +229,7 @@ def _of_candidates(
             break
     settled = _chosen_energy(mask, tables, assignment, _options(mask, tables, assignment)).amin(1)
     return Equilibrium(
-        initial=initial,
+        initial_energy=initial,
         energy=solved,
         optimum=torch.minimum(solved, settled),  # they may differ by rounding errors
         gradient_norm=torch.full_like(solved, torch.nan),

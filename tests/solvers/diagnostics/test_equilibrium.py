@@ -91,7 +91,7 @@ def test_the_equilibrium_of_a_linear_quadratic_game_has_no_gap(kind):
     assert found.gradient_norm.item() < 1e-9
     assert found.energy.item() == pytest.approx(game.energy(game.scene, game.parameters, solved).item(), rel=1e-12)
     assert found.optimum.item() == pytest.approx(found.energy.item(), rel=1e-10)
-    assert found.initial.item() == -7.0, "as the solver says"
+    assert found.initial_energy.item() == -7.0, "as the solver says"
 
 
 @KINDS
@@ -192,7 +192,7 @@ def test_a_game_shared_by_all_modes_equals_one_per_mode():
     torch.testing.assert_close(found.energy, energy(scene, parameters, controls[:, 2:])[:, 0])
 
 
-FIELDS = ("initial", "energy", "optimum", "gradient_norm", "nash_gap", "objective")
+FIELDS = ("initial_energy", "energy", "optimum", "gradient_norm", "nash_gap", "objective")
 
 
 @KINDS
