@@ -174,10 +174,12 @@ def test_other_scenes_and_absent_agents_do_not_change_solutions(kind):
     "broken",
     ["no number", "minus infinity", "minus infinity of a pair", "nothing fits", "a triangle of two colours"],
 )
-def test_scenes_without_an_answer_stop_and_leave_the_others_alone(kind, broken):
+@pytest.mark.parametrize("apart", [0.0, 0.2])
+def test_scenes_without_an_answer_stop_and_leave_the_others_alone(kind, broken, apart):
     scene, game = played(scenes=3)
+    solver = kind(candidates=3, modes=2, apart=apart)
     unary, pair = torch.randn(3, 3, 3, dtype=torch.float64), torch.rand(3, 3, 3, 3, dtype=torch.float64)
-    whole = kind(candidates=3, modes=2)(Given(unary.clone(), pair.clone()), scene, game)
+    whole = solver(Given(unary.clone(), pair.clone()), scene, game)
     if broken == "nothing fits":
         pair[1, 0] = INF
     elif broken == "a triangle of two colours":  # every pair can differ, but not all three; messages do not notice it
@@ -188,7 +190,7 @@ def test_scenes_without_an_answer_stop_and_leave_the_others_alone(kind, broken):
     else:
         unary[1, 2, 1] = NAN if broken == "no number" else -INF
     unary.requires_grad_()
-    solution = kind(candidates=3, modes=2)(Given(unary, pair), scene, game)
+    solution = solver(Given(unary, pair), scene, game)
     assert (solution.status[1] == Status.STOPPED).all()
     assert torch.equal(solution.controls[1], game.initial_controls[1, 0].expand(2, 3, 5, 2))
     assert solution.tables.log_partition[1].isnan()
