@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from numbers import Real
+from numbers import Integral, Real
 from typing import Any
 
 from epo_lightning.registry import ConfigError, nearest
@@ -38,8 +38,18 @@ def check_whole(key: str, value: Any, least: int = 1) -> None:
     Raises:
         ConfigError: another value; the message names the key.
     """
-    if not isinstance(value, int) or isinstance(value, bool) or value < least:
+    if not isinstance(value, Integral) or isinstance(value, bool) or value < least:
         raise ConfigError(f"{key} must be a whole number, {least} or more, not {value!r}")
+
+
+def check_share(key: str, value: Any, meaning: str) -> None:
+    """Check that a configured value is a number above 0 and not above 1.
+
+    Raises:
+        ConfigError: another value; the message names the key and what it is the share of.
+    """
+    if not is_number(value) or not 0 < value <= 1:
+        raise ConfigError(f"{key} is {value!r}, expected a number in (0, 1]: {meaning}")
 
 
 def check_number(key: str, value: Any, zero: bool = False, finite: bool = True, null: bool = False) -> None:

@@ -58,14 +58,6 @@ def data_recipe(section: Mapping[str, Any]) -> int:
     return section.get("recipe", LATER["data.recipe"])
 
 
-def with_recipe(config: Mapping[str, Any]) -> dict[str, Any]:
-    """A recorded configuration that names the recipe of RPI's data, also where the run is older than this setting."""
-    data = config.get("data")
-    if not isinstance(data, Mapping) or data.get("name") != "rpi":
-        return dict(config)
-    return {**config, "data": {**data, "recipe": data_recipe(data)}}
-
-
 def essence(config: Mapping[str, Any]) -> dict[str, Any]:
     """The part of a resolved configuration that decides on the result, as plain JSON values; 2.0 and 2 are the same."""
     return {section: _plain(config.get(section), section) for section in SECTIONS}

@@ -42,7 +42,7 @@ def _read(hint: Any, value: Any, where: str) -> Any:
 
 def _unfit(key: str, value: Any, hint: Any) -> ConfigError:
     """The error for a value of another type; a list of values that would fit is meant as a run of each."""
-    message = f"{key} must be {describe(hint)}, not {value!r}"
+    message = f"{key} must be {describe(hint)}, not {'null' if value is None else repr(value)}"
     if isinstance(value, list) and value and all(fits(entry, hint) for entry in value):
         each = ",".join(map(str, value))
         message += f": for a run of each, write {each} without brackets, in a sweep or with the option -m"
@@ -88,11 +88,13 @@ def describe(hint: Any) -> str:
         return names[hint]
     base = origin or hint
     if isinstance(base, type) and issubclass(base, Mapping):
-        return "a mapping" + (f" with {describe(arguments[1])} for every name" if len(arguments) == 2 else "")
+        named = len(arguments) == 2 and arguments[1] is not Any
+        return "a mapping" + (f" with {describe(arguments[1])} for every name" if named else "")
     if isinstance(base, type) and issubclass(base, Sequence):
         if arguments and typing.get_origin(arguments[0]) is Literal:
             return "a list with any of " + ", ".join(map(str, typing.get_args(arguments[0])))
-        return "a list" + (f" of {describe(arguments[0])}" if arguments else "")
+        several = {int: "whole numbers", float: "numbers", str: "texts"}
+        return "a list" + (f" of {several.get(arguments[0]) or describe(arguments[0])}" if arguments else "")
     return str(getattr(base, "__name__", base))
 
 

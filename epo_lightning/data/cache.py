@@ -29,7 +29,6 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from epo_lightning.data.mapped import mapped, not_finite
-from epo_lightning.files import whole_file
 from epo_lightning.registry import ConfigError
 
 FORMAT = 1
@@ -140,8 +139,15 @@ def write_file(path: Path, content: bytes) -> None:
     Raises:
         OSError: the disk is full or read-only; the message names the file.
     """
-    with writing(path), whole_file(path) as temporary:
-        temporary.write_bytes(content)
+    # Processes with the same number may write the same file from several machines.
+    temporary = path.with_name(f".{path.name}.{platform.node()}-{os.getpid()}")
+    with writing(path):
+        try:
+            temporary.write_bytes(content)
+            temporary.replace(path)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
 
 
 def write(

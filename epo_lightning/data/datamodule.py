@@ -20,6 +20,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 from torch.utils.data.distributed import DistributedSampler
 
+from epo_lightning.checks import check_share
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import Scene
 from epo_lightning.task import Task
@@ -205,16 +206,13 @@ class SceneDataModule(LightningDataModule):
 
     def __init__(self, batch_size: int, seed: int, share: float = 1.0) -> None:
         super().__init__()
-        if not 0 < share <= 1:
-            raise ConfigError(
-                f"data.share is {share}, expected a number in (0, 1]: the share of the scenes that is used"
-            )
+        check_share("data.share", share, "the share of the scenes that is used")
         if not isinstance(batch_size, int) or isinstance(batch_size, bool) or batch_size < 2:
             raise ConfigError(
-                f"batch_size is {batch_size!r}, but batch normalisation needs at least 2 scenes in a batch"
+                f"data.batch_size is {batch_size!r}, expected a whole number of 2 or more, for batch normalisation"
             )
         if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed < 2**31:
-            raise ConfigError(f"seed is {seed!r}, expected a whole number from 0 to 2^31 - 1")
+            raise ConfigError(f"data.seed is {seed!r}, expected a whole number from 0 to 2^31 - 1")
         self.batch_size, self.seed, self.share = batch_size, seed, share
         self.order_seed = seed
         self._opened: dict[str, SceneDataset] = {}

@@ -9,7 +9,7 @@ import epo_lightning
 from epo_lightning.data.recorded.recordings import RecordedData
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.settings import Settings
-from epo_lightning.identity import check_unchanged, with_recipe
+from epo_lightning.identity import check_unchanged
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder
 from epo_lightning.schema import read
@@ -59,7 +59,7 @@ def settings_of(run: RunFolder) -> Settings:
     """
     config = run.config()
     check_unchanged(config, run.record, run.config_file)
-    return read(Settings, with_recipe(config))
+    return read(Settings, config)
 
 
 def refuse_changed(run: RunFolder, data: Any) -> None:

@@ -21,7 +21,7 @@ from epo_lightning.experiment.evaluate import score
 from epo_lightning.experiment.opening import refuse_changed, settings_of
 from epo_lightning.experiment.provenance import commit, of_other_code, versions
 from epo_lightning.forecasters.checkpoint import read_checkpoint
-from epo_lightning.identity import check_unchanged, differences, identity, row_identity, with_recipe
+from epo_lightning.identity import check_unchanged, differences, identity, row_identity
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import FAILED, FINISHED, TRAINING, RunFolder
 from epo_lightning.schema import read
@@ -102,7 +102,7 @@ def resume(run: RunFolder) -> None:
     complete = run.finished and all(run.metrics_file(which).is_file() for which in settings.measures)
     if complete and distributed.here(settings.trainer.devices).leads:
         raise ConfigError(f"{run.path} is finished: `epo evaluate run={run.path}` scores it")
-    train(with_recipe(run.config()), begun=run)
+    train(run.config(), begun=run)
 
 
 def fit(

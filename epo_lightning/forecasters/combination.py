@@ -58,13 +58,14 @@ class Combination:
     @property
     def obstacle(self) -> str | None:
         """The reason why the combination cannot work; None where it can."""
-        energy, solver, backward, objective = (f"{kind}={self.names[kind]}" for kind in KINDS)
+        solver, backward, objective = (f"{kind}={self.names[kind]}" for kind in KINDS[1:])
         for part, needed in (
             (solver, self.solver.needs_from_energy),
             (backward, self.backward.needs_from_energy),
             (objective, self.objective.needs_from_energy),
         ):
             if lacking := needed - self.energy.offers:  # all of them are needed
+                energy = f"energy.name={self.names['energy']}"
                 return f"{part} needs an energy with {_and(lacking)}, which {energy} does not offer"
         for part, needed in (
             (backward, self.backward.needs_from_solver),

@@ -110,9 +110,9 @@ def test_a_share_of_the_games_has_whole_games_within_larger_shares_and_only_in_t
     assert data(games_share=1.0).digest == data().digest
 
 
-@pytest.mark.parametrize("share", [0.0, 1.5])
+@pytest.mark.parametrize("share", [0.0, 1.5, "a", None])
 def test_a_share_of_the_games_outside_of_0_and_1_is_refused(data, share):
-    with pytest.raises(ConfigError, match=f"data.games_share is {share}"):
+    with pytest.raises(ConfigError, match=f"data.games_share is {share!r}"):
         data(games_share=share)
 
 
@@ -240,7 +240,7 @@ def test_a_batch_that_ranks_cannot_share_evenly_is_refused(monkeypatch):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"batch_size": 1}, "batch normalisation needs at least 2"),
+        ({"batch_size": 1}, r"data\.batch_size is 1, expected a whole number of 2 or more, for batch normalisation"),
         ({"games": 2}, r"data\.games must be a whole number, 3 or more, not 2"),
         ({"placements": 0}, r"data\.placements must be a whole number, 1 or more, not 0"),
         ({"placements": -4}, r"data\.placements .* not -4"),
@@ -263,10 +263,10 @@ def test_invalid_settings_are_refused(settings, message):
 
 
 def test_data_of_earlier_versions_keep_their_digest_and_command():
-    earlier = RPIData(split="hard", placements=8, recipe=1)
+    earlier = RPIData(split="hard", placements=8)
     assert earlier.digest == "a90b8d2bfafc6f96"
     assert earlier.command == "epo generate data=rpi data.recipe=1 data.placements=8 data.split=hard"
-    today = RPIData(split="hard", placements=8)
+    today = RPIData(split="hard", placements=8, recipe=2)
     assert today.command == "epo generate data=rpi data.placements=8 data.split=hard"
 
 
@@ -279,7 +279,7 @@ def test_the_digest_follows_what_a_run_depends_on(tmp_path):
         {"split": "hard"},
         {"targets": "executed"},
         {"sizes": None},
-        {"recipe": 1},
+        {"recipe": 2},
     ):
         assert RPIData(**change).digest != base
     folders = {RPIData(targets=targets).folder for targets in ("executed", "sampled", "both")}
@@ -308,7 +308,7 @@ def test_a_share_of_every_split_is_the_same_whatever_the_seed(tmp_path):
     assert len(Share(whole.dataset("train"), 1e-9)) == 1
 
 
-@pytest.mark.parametrize("share", [0.0, -0.5, 1.5])
+@pytest.mark.parametrize("share", [0.0, -0.5, 1.5, "a", True])
 def test_invalid_shares_are_refused(share):
-    with pytest.raises(ConfigError, match=r"data\.share"):
+    with pytest.raises(ConfigError, match=rf"data\.share is {share!r}, expected a number"):
         RPIData(share=share)

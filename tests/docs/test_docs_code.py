@@ -15,7 +15,7 @@ ELSEWHERE = {
 }
 """Blocks that other tests run, by page and a word in them."""
 CHEAPER = {
-    "repeats=7": "repeats=1",
+    "repeats=25": "repeats=1",
     '"cache/highway_sim-recordings-..."': repr(str(FIXTURE)),
     '("commonroad", "data/us101")': repr(("exid", str(FIXTURE))),
 }

@@ -47,7 +47,7 @@ def lines_until(action: Callable[[], None], at: int) -> int:
 
         def trace(frame: FrameType, event: str, argument: Any) -> Any:
             nonlocal count
-            if not frame.f_code.co_filename.endswith(("csv_log.py", "csv_logs.py", "run_folder.py")):
+            if not frame.f_code.co_filename.endswith(("csv_log.py", "csv_logs.py", "run_folder.py", "/files.py")):
                 return None
             count += event == "line"
             if 0 < at == count:

@@ -58,7 +58,8 @@ class SplitRule:
                 )
             for group in sorted(chosen - set(groups)):
                 raise ConfigError(
-                    f"data.test names the group {group!r}, which no recording has: {nearest(group, groups)}"
+                    f"data.test names the group {group!r}, which no recording has: {nearest(group, groups)}; "
+                    "data.test=null draws the test split"
                 )
         rest = [source for source in sources if source.group not in chosen]
         unit = "name" if self.val_by == "recording" else "group"
@@ -140,13 +141,14 @@ class SplitRule:
             drawn = f"data.test=null draws the test split; groups with scenes are {_some(holding)}"
         else:
             now = f"data.seed={self.seed}, data.test=null"
-            drawn = f"data.test can name test groups; groups with scenes are {_some(holding)}"
+            drawn = f"{'data.test can name test groups; ' * (len(holding) > 1)}groups with scenes are {_some(holding)}"
         helps = [f"{key}={value}" for key, value in self._alternatives(sources, full)]
         change = (
             f"Set {' or '.join(helps)}, which gives every split recordings with scenes"
             if helps
             else f"None of data.seed=0..{SEEDS - 1} and of the groups for data.test gives every split a recording with "
-            f"scenes: add recordings{'' if self.val_by == 'recording' else ', or set data.val_by=recording'}"
+            f"scenes: add recordings{' of another group' * (len(holding) == 1)}"
+            f"{', or set data.val_by=recording' * (self.val_by != 'recording')}"
         )
         shares = f"data.test_share={self.test_share}, data.val_share={self.val_share}"
         return f"The splits follow from {now}, {shares}. {change}; {drawn}."

@@ -101,7 +101,8 @@ class WindowConfig:
             ("lanes", 1),
             ("lines", 1),
         ):
-            if (value := getattr(self, name)) is not None:
+            value = getattr(self, name)
+            if value is not None or name not in ("lanes", "lines"):
                 check_whole(f"data.windows.{name}", value, least)
         for name in ("dt", "speed_limit", "radius", "smoothing"):
             check_number(f"data.windows.{name}", getattr(self, name), null=name in ("radius", "smoothing"))

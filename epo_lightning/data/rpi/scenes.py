@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Integer
 from torch import Tensor
 
-from epo_lightning.checks import check_choice, check_whole
+from epo_lightning.checks import check_choice, check_share, check_whole
 from epo_lightning.data import cache
 from epo_lightning.data.cache import SPLITS
 from epo_lightning.data.datamodule import SceneDataModule, epoch_generator
@@ -105,7 +105,8 @@ class RPIData(SceneDataModule):
         share: share of the scenes of every split that is used, drawn once.
         games_share: share of the training split's games that is used, drawn once; a game is a start of the pedestrian in a
             main game. Smaller shares are contained in larger ones; validation and test stay whole.
-        recipe: version of the method, 2; or 1, in which the angle of the first placement is a function of w.
+        recipe: version of the method, 2; or 1, in which the angle of the first placement is a function of w. The default is
+            that of runs that were trained before this was a setting; ``conf/data/rpi.yaml`` has 2.
     """
 
     num_agents, history = AGENTS, HISTORY + 1
@@ -124,17 +125,14 @@ class RPIData(SceneDataModule):
         batch_size: int = 32,
         share: float = 1.0,
         games_share: float = 1.0,
-        recipe: int = RECIPE,
+        recipe: int = 1,
     ) -> None:
         super().__init__(batch_size, seed, share)
         check_whole("data.recipe", recipe)
         if recipe > RECIPE:
             raise ConfigError(f"data.recipe is {recipe}, expected {RECIPE}, or 1 for data of earlier versions")
         self.recipe = recipe
-        if not 0 < games_share <= 1:
-            raise ConfigError(
-                f"data.games_share is {games_share}, expected a number in (0, 1]: the share of the training games"
-            )
+        check_share("data.games_share", games_share, "the share of the training games")
         self.games_share = games_share
         self.root = Path(root).expanduser() if root else cache.default_root()
         check_whole("data.games", games, least=3)  # training, validation and test have main games of their own
@@ -144,7 +142,9 @@ class RPIData(SceneDataModule):
         check_choice("data.split", split, RULES)
         check_choice("data.targets", targets, TARGETS)
         self.solver, self.split, self.targets = solver, split, targets
-        if sizes is not None and (isinstance(sizes, str) or len(sizes) != len(SPLITS)):
+        if sizes is not None and (
+            isinstance(sizes, str) or not isinstance(sizes, Sequence) or len(sizes) != len(SPLITS)
+        ):
             raise ConfigError(f"data.sizes is {sizes!r}, expected three numbers ({', '.join(SPLITS)}) or null for all")
         for size in sizes or ():
             check_whole("data.sizes", size)

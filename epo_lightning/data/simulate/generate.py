@@ -57,15 +57,17 @@ def config(
     chosen = known if layouts is None else sorted(set(layouts))
     for layout in chosen:
         if layout not in known:
-            raise ConfigError(f"unknown layout {layout!r}: known are {', '.join(map(str, known))}")
+            raise ConfigError(
+                f"data.layouts names the unknown layout {layout!r}: known are {', '.join(map(str, known))}"
+            )
     if not chosen:
-        raise ConfigError(f"layouts is empty: choose from {', '.join(map(str, known))}")
+        raise ConfigError(f"data.layouts is empty: choose from {', '.join(map(str, known))}")
     if not 1 <= recordings * len(chosen) <= 1000:
         raise ConfigError(
-            f"recordings is {recordings} for each of {len(chosen)} layouts: 1 to 1000 in all are possible"
+            f"data.recordings is {recordings} for each of {len(chosen)} layouts: 1 to 1000 in all are possible"
         )
     if not 0.1 <= minutes <= 60.0:
-        raise ConfigError(f"minutes is {minutes}: expected 0.1 to 60 minutes per recording")
+        raise ConfigError(f"data.minutes is {minutes}: expected 0.1 to 60 minutes per recording")
     return {
         "recipe": RECIPE,
         "seed": seed,

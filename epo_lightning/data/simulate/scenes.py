@@ -88,8 +88,8 @@ class SimulatedHighway(RecordedData):
         for name, value in defaults.items():
             if self.simulation[name] != value:
                 words.append(f"data.{name}={self.simulation[name]}".replace(" ", ""))
-        if TRAFFIC.get(self.dataset_name) != self.traffic:
-            words.append(f"++data.traffic={self.traffic}")  # whether or not the file of the data set has this setting
+        if self.traffic != TRAFFIC.get(self.dataset_name, "free"):
+            words.append(f"++data.traffic={self.traffic}")  # whether or not its file has this setting
         if self.root != cache.default_root():
             words.append(f"data.root={self.root}")
         return shlex.join(["epo", "generate", *words])

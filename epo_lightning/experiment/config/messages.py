@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import re
 from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -204,7 +205,7 @@ def _unknown_key(instance: Hydra, name: str, key: str, overrides: Sequence[str])
             if word not in defaults.overrides.known_choices:
                 return f"unknown key {key!r} of epo {name}: {word} is a choice of epo train, and a run keeps it"
             return f"{key} needs a choice of {word}: add {word}=<one of {', '.join(options)}>"
-        if word not in names and len(walked) == 1 and names and word in _arguments(walked[0], config):
+        if word not in names and names and word in _settings_in(walked, config):
             return f"{key} is a setting that the chosen file of {walked[0]} leaves at its default: set it by +{key}=<value>"
         if word not in names and walked:
             place = ".".join(walked)
@@ -223,9 +224,16 @@ def _unknown_key(instance: Hydra, name: str, key: str, overrides: Sequence[str])
     return f"unknown key {key!r}"
 
 
-def _arguments(group: str, section: DictConfig) -> Collection[str]:
-    """Names of the arguments of the part that a section chooses, which its file need not list; empty for other sections."""
-    chosen = parts(group).get(str(section.get("name")))
+def _settings_in(place: Sequence[str], section: DictConfig) -> Collection[str]:
+    """Names of the settings of a place in the configuration, of which its file need not list all; empty for other places.
+
+    They are the arguments of the part that the section chooses, and the fields of ``data.windows``.
+    """
+    if list(place) == ["data", "windows"]:
+        from epo_lightning.data.recorded.windows import WindowConfig
+
+        return [field.name for field in dataclasses.fields(WindowConfig)]
+    chosen = parts(place[0]).get(str(section.get("name"))) if len(place) == 1 else None
     return inspect.signature(chosen).parameters if chosen else ()
 
 

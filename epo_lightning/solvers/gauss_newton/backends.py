@@ -1,7 +1,7 @@
 """The implementations of damped steps, and the choice of one of them for a game.
 
 - ``compiled``: the kernel for CPUs (:mod:`.compiled`). PyTorch helps it with features of the user (:mod:`.assisted`).
-- ``host``: the same kernel for games on a GPU, which are copied (:mod:`.hosted`).
+- ``host``: the same kernel for games on a GPU, which are copied (:mod:`.hosted`); on a CPU it is ``compiled``.
 - ``warp``: fused kernels on a GPU (:mod:`.fused`).
 - ``pytorch``: operations of PyTorch, anywhere and for every game (:mod:`.structured`).
 """
@@ -18,7 +18,7 @@ from torch import Tensor
 from epo_lightning.forecast import GameParameters, Solution
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import Scene
-from epo_lightning.solvers.gauss_newton import assisted, compiled, fused, hosted, structured
+from epo_lightning.solvers.gauss_newton import assisted, compiled, fused, hosted, kernel_games, structured
 from epo_lightning.warp_kernels import installed
 
 NAMES = ("auto", "pytorch", "compiled", "host", "warp")
@@ -95,12 +95,14 @@ def choose(
     """
     if name == "pytorch":
         return structured
-    layer = hosted.cpu_layer(energy)
-    chosen = {"compiled": layer, "host": hosted, "warp": fused}.get(name)
-    if chosen is None and parameters.initial_controls.device.type == "cpu":
+    layer, on_cpu = hosted.cpu_layer(energy), parameters.initial_controls.device.type == "cpu"
+    chosen = {"compiled": layer, "host": layer if on_cpu else hosted, "warp": fused}.get(name)
+    if chosen is None and on_cpu:
         chosen = layer
     elif chosen is None and fixed and energy.custom is not None:
-        return _replaced("the fused kernels do not know features of your own")
+        reason = kernel_games.unknown(energy, scene, parameters, fused.SIZES[-1], "the fused layer")
+        assert reason is not None
+        return _replaced(reason)
     elif chosen is None:
         chosen = fused if fixed and fused.obstacle(energy, scene, parameters) is None else hosted
     obstacle = chosen.obstacle(energy, scene, parameters)

@@ -47,7 +47,7 @@ class ConstrainedGame:
         own, pair = ([name for name in part if name not in self.names] for part in (self.energy.own, self.energy.pair))
         return dataclasses.replace(self.energy, own=own, pair=pair)
 
-    def excess(self, controls: Tensor) -> dict[str, Float[Tensor, "B M R problems"]]:
+    def excess(self, controls: Tensor) -> dict[str, Float[Tensor, "B M R steps"]]:
         """h by constraint, positive where it is violated, and -inf where there is none; a bound has two entries."""
         return {name: value for name, value, _ in self._signals(controls, controls.new_zeros(0, *controls.shape))}
 

@@ -94,8 +94,6 @@ def copies_of(device: torch.device) -> Copies | None:
 def obstacle(energy: FeatureEnergy, scene: Scene, parameters: GameParameters) -> str | None:
     """Reason why a game cannot be solved on the host and copied; None where it can."""
     device = parameters.initial_controls.device
-    if device.type == "cpu":
-        return "these tensors are on the CPU already, and nothing has to be copied"
     if copies_of(device) is None:
         return f"the game is copied from CUDA devices, and these tensors are on {device}"
     if device.type == "cuda" and torch.cuda.is_current_stream_capturing():

@@ -58,8 +58,8 @@ class LevenbergMarquardt(Stepwise):
         newton_steps: number of adaptive Newton steps, with the exact Hessian, after the S Gauss-Newton steps. Near a minimum
             they converge quadratically, and Gauss-Newton steps linearly. They have no derivative of their own: use
             ``backward=implicit`` or ``detached``.
-        backend: ``pytorch``; ``compiled``, the kernel for CPUs; ``host``, the same kernel for tensors on a GPU, which are
-            copied; ``warp``, fused kernels on a GPU; or ``auto``, the choice of :func:`.backends.choose`.
+        backend: ``pytorch``; ``compiled``, the kernel for CPUs; ``host``, the same kernel, also for tensors on a GPU, which
+            are copied; ``warp``, fused kernels on a GPU; or ``auto``, the choice of :func:`.backends.choose`.
     """
 
     needs_from_energy = frozenset({FEATURES})

@@ -94,8 +94,8 @@ class _Assembly(torch.autograd.Function):
         blocks: Float[Tensor, "B M N D D"],
         rows: Float[Tensor, "B M N R"],
         changes: Float[Tensor, "B M N D R"],
-        end_rows: Float[Tensor, "B M Q problems"],
-        end_changes: Float[Tensor, "B M Q D problems"],
+        end_rows: Float[Tensor, "B M Q size"],
+        end_changes: Float[Tensor, "B M Q D size"],
     ) -> tuple[Tensor, Tensor]:
         ctx.dtype = rows.dtype
         rows, changes, end_rows, end_changes = (

@@ -135,6 +135,8 @@ def test_invalid_sweeps_are_refused(refused: Callable[..., str]) -> None:
     assert "rpi_main" in refused("sweep", "seed=1")
     assert "'seed'" in refused("sweep", "rpi_main", "sede=1")
     assert "set it by +data.games_share=<value>" in refused("sweep", "rpi_main", "data.games_share=0.1")
+    nested = "data.windows.off_lane"
+    assert f"set it by +{nested}=<value>" in refused("sweep", "us101_main", f"{nested}=agent")
     assert "none has" in refused("sweep", "status", "rpi_main")
     assert "run_dir" in refused("sweep", "rpi_main", "run_dir=x")
     assert "epo sweep generate <name>" in refused("sweep", "generate")

@@ -253,7 +253,7 @@ def test_fixed_steps_with_features_of_the_user_stay_on_the_device(own_features):
     """A CUDA graph can contain them there."""
     energy, scene, game = own_features
     backends.say_once.cache_clear()
-    with pytest.warns(UserWarning, match=r"do not know features of your own\. Plain PyTorch does the same"):
+    with pytest.warns(UserWarning, match="the fused layer does not know the feature 'drift'"):
         assert backends.choose("auto", energy, remote(scene), remote(game), fixed=True) is structured
     assert backends.choose("auto", energy, remote(scene), remote(game)) is hosted
     assert backends.choose("host", energy, remote(scene), remote(game), fixed=True) is hosted
@@ -262,8 +262,7 @@ def test_fixed_steps_with_features_of_the_user_stay_on_the_device(own_features):
 def test_the_host_backend_is_for_games_on_a_device_that_the_kernel_knows():
     scene, energy = random_scene(2, 2, history=2), FeatureEnergy(["goal", "acc"])
     game = random_game(scene)
-    with pytest.raises(ValueError, match="backend is 'host', but these tensors are on the CPU already"):
-        backends.choose("host", energy, scene, game)
+    assert backends.choose("host", energy, scene, game) is compiled, "a run of a GPU is scored on a machine without one"
     with pytest.raises(ValueError, match="backend is 'compiled', but the compiled layer runs on CPUs"):
         backends.choose("compiled", energy, remote(scene), remote(game))
     heun = FeatureEnergy(["goal", "acc"], dynamics=Unicycle("heun"))

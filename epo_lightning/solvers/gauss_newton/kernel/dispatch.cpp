@@ -169,17 +169,17 @@ int64_t epo_differentiate(const void* tape, const EpoGame* game, const EpoRun* r
 
 /// Writes the equilibria of linear-quadratic games. Returns 0, or 1 if there was not enough memory; so do the next two functions.
 int64_t epo_lq_equilibria(const EpoLQGames* games, int64_t threads) {
-    return in_ranges(games->S, threads, [&](int64_t first, int64_t last) { chosen->lq_equilibria(games, first, last); });
+    return in_ranges(games->games, threads, [&](int64_t first, int64_t last) { chosen->lq_equilibria(games, first, last); });
 }
 
 /// The adjoint of a call of `epo_lq_equilibria`.
 int64_t epo_lq_pull_back(const EpoLQGames* games, const EpoLQGradients* gradients, int64_t threads) {
-    return in_ranges(games->S, threads, [&](int64_t first, int64_t last) { chosen->lq_pull_back(games, gradients, first, last); });
+    return in_ranges(games->games, threads, [&](int64_t first, int64_t last) { chosen->lq_pull_back(games, gradients, first, last); });
 }
 
 /// Writes the trajectories that follow policies.
 int64_t epo_lq_follow(const EpoPolicies* policies, int64_t threads) {
-    return in_ranges(policies->S, threads, [&](int64_t first, int64_t last) { chosen->lq_follow(policies, first, last); });
+    return in_ranges(policies->games, threads, [&](int64_t first, int64_t last) { chosen->lq_follow(policies, first, last); });
 }
 
 /// Solves driving games for feedback equilibria. Returns as the functions above, and so does the next one.

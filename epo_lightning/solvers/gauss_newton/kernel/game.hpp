@@ -125,20 +125,20 @@ struct EpoGradients {
 /// S linear-quadratic games of N agents over K steps, and their equilibria, in double precision; see `solvers/feedback/lq_game.py`.
 /// All arrays are contiguous.
 struct EpoLQGames {
-    int64_t S, N, K;
+    int64_t games, N, K;
     double rho;
-    const double *A, *B;           // [S, N, K, 4, 4], [S, N, K, 4, 2]
-    const double* own_cost;        // [S, N, K, 4, 5]
-    const double* pair_cost;       // [S, P, K, 8, 9]
-    const double *effort, *push;   // [S, N, K, 2, 2], [S, N, K, 2]
-    const uint8_t* free;           // [S, N, K]
-    double *gains, *offsets;       // [S, K, 2 N, 4 N], [S, K, 2 N]
-    uint8_t* unique;               // [S]
+    const double *A, *B;           // [games, N, K, 4, 4], [games, N, K, 4, 2]
+    const double* own_cost;        // [games, N, K, 4, 5]
+    const double* pair_cost;       // [games, P, K, 8, 9]
+    const double *effort, *push;   // [games, N, K, 2, 2], [games, N, K, 2]
+    const uint8_t* free;           // [games, N, K]
+    double *gains, *offsets;       // [games, K, 2 N, 4 N], [games, K, 2 N]
+    uint8_t* unique;               // [games]
 };
 
 /// The cotangent that the adjoint reads, and the gradients that it writes.
 struct EpoLQGradients {
-    const double* controls;        // [S, K, 2 N]
+    const double* controls;        // [games, K, 2 N]
     double *A, *B, *own_cost, *pair_cost, *effort, *push;  // as in EpoLQGames
 };
 
@@ -154,15 +154,15 @@ struct EpoFeedback {
     int64_t* status;               // [B, M]: COMPLETED if the iteration has ended, DAMPED if not, STOPPED if it was not possible
 };
 
-/// Policies of S games of N agents around given trajectories, and the trajectories that follow them.
+/// Policies of games of N agents around given trajectories, and the trajectories that follow them.
 struct EpoPolicies {
-    int64_t S, N, K;
+    int64_t games, N, K;
     double dt, beta;               // time step [s]; share of the velocity before a step in its displacement
-    const double* start;           // [S, N, 4]
-    const double *states, *controls;  // [S, N, K, 4], [S, N, K, 2]
+    const double* start;           // [games, N, 4]
+    const double *states, *controls;  // [games, N, K, 4], [games, N, K, 2]
     const double *gains, *offsets;  // as in EpoLQGames
-    const double* length;          // [S] factor of the offsets
-    double *visited, *chosen;      // [S, N, K, 4], [S, N, K, 2]
+    const double* length;          // [games] factor of the offsets
+    double *visited, *chosen;      // [games, N, K, 4], [games, N, K, 2]
 };
 }
 

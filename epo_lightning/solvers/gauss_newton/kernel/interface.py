@@ -122,7 +122,7 @@ class EpoLQGames(ctypes.Structure):
     """Linear-quadratic games and their equilibria; fields as in `game.hpp`."""
 
     _fields_ = (
-        *((name, Integer) for name in ("S", "N", "K")),
+        *((name, Integer) for name in ("games", "N", "K")),
         ("rho", Real),
         *((name, Address) for name in (*_PARTS, "free", "gains", "offsets", "unique")),
     )
@@ -138,7 +138,7 @@ class EpoPolicies(ctypes.Structure):
     """Policies around trajectories, and the trajectories that follow them; fields as in `game.hpp`."""
 
     _fields_ = (
-        *((name, Integer) for name in ("S", "N", "K")),
+        *((name, Integer) for name in ("games", "N", "K")),
         *((name, Real) for name in ("dt", "beta")),
         *(
             (name, Address)
