@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
 from docs.pages import PAGES, ROOT, blocks
@@ -33,7 +35,8 @@ SLOW = ("highway_sim.md-0", "features.md-0")
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in BLOCKS])
-def test_code_blocks_run(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_code_blocks_run(name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("EPO_CACHE", str(tmp_path))
     monkeypatch.syspath_prepend(str(ROOT))  # for `benchmarks`, which runs from the root of the repository
     text = BLOCKS[name]
     for one, other in CHEAPER.items():
