@@ -141,14 +141,16 @@ class SplitRule:
             drawn = f"data.test=null draws the test split; groups with scenes are {_some(holding)}"
         else:
             now = f"data.seed={self.seed}, data.test=null"
-            drawn = f"{'data.test can name test groups; ' * (len(holding) > 1)}groups with scenes are {_some(holding)}"
+            named = "data.test can name test groups; " if len(holding) > 1 else ""
+            drawn = f"{named}groups with scenes are {_some(holding)}"
         helps = [f"{key}={value}" for key, value in self._alternatives(sources, full)]
+        of_another_group = " of another group" if len(holding) == 1 else ""
+        by_recording = "" if self.val_by == "recording" else ", or set data.val_by=recording"
         change = (
             f"Set {' or '.join(helps)}, which gives every split recordings with scenes"
             if helps
             else f"None of data.seed=0..{SEEDS - 1} and of the groups for data.test gives every split a recording with "
-            f"scenes: add recordings{' of another group' * (len(holding) == 1)}"
-            f"{', or set data.val_by=recording' * (self.val_by != 'recording')}"
+            f"scenes: add recordings{of_another_group}{by_recording}"
         )
         shares = f"data.test_share={self.test_share}, data.val_share={self.val_share}"
         return f"The splits follow from {now}, {shares}. {change}; {drawn}."
