@@ -267,9 +267,7 @@ def test_a_split_without_scenes_is_an_error_with_the_reasons(folder):
 def test_recordings_of_a_single_group_need_others(folder):
     for file in (*folder.glob("b-*"), *folder.glob("c-*")):
         file.unlink()
-    with pytest.raises(
-        ConfigError, match=r"3 recording\(s\) in 1 group\(s\) are too few: .*add recordings of another group"
-    ):
+    with pytest.raises(ConfigError, match=r"3 recording\(s\) in 1 group\(s\) are too few: .* of another group"):
         data(folder, test=None).generate(workers=1, progress=False)
 
 
