@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from numbers import Integral, Real
+from numbers import Real
 from typing import Any
 
 from epo_lightning.registry import ConfigError, nearest
@@ -38,7 +38,7 @@ def check_whole(key: str, value: Any, least: int = 1) -> None:
     Raises:
         ConfigError: another value; the message names the key.
     """
-    if not isinstance(value, Integral) or isinstance(value, bool) or value < least:
+    if not isinstance(value, int) or isinstance(value, bool) or value < least:
         raise ConfigError(f"{key} must be a whole number, {least} or more, not {value!r}")
 
 

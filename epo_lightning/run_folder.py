@@ -52,8 +52,6 @@ State = Literal["waiting", "running", "interrupted", "failed", "finished"]
 """State of a run. Waiting: it has not begun. Interrupted: it has begun, no process works on it, and no error is recorded."""
 SILENCE = 600.0
 """Seconds without new progress after which a run on another machine, whose lock may be invisible here, is interrupted."""
-
-
 OTHER = "scores-on-"
 """Beginning of the names of files with scores on data on which a run was not trained."""
 LOCK = ".lock"

@@ -308,6 +308,11 @@ def test_joined_scenes_are_the_same_scenes():
         ("history", 1, "data.windows.history must be a whole number, 2 or more, not 1"),
         ("agents", 0, "data.windows.agents must be a whole number, 1 or more, not 0"),
         ("every", None, "data.windows.every must be a whole number, 1 or more, not None"),
+        (
+            "history",
+            np.int64(10),
+            "data.windows.history must be a whole number",
+        ),  # JSON, which identifies data, has none
         ("history", 10.5, "data.windows.history must be a whole number, 2 or more, not 10.5"),
         ("least_agents", 5, "must not be more than"),
         ("radius", -1.0, "data.windows.radius must be a number, positive, and finite, or null, not -1.0"),
