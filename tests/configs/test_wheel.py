@@ -15,7 +15,7 @@ _SOLVE = """
 import sys
 sys.path.insert(0, {site!r})
 from pathlib import Path
-from epo_lightning.solvers.gauss_newton import compiled
+from epo_lightning.solvers.gauss_newton.backends import compiled
 from epo_lightning.solvers.gauss_newton.kernel import interface
 print(Path(compiled.__file__).parents[3], interface.library().epo_levels() > 0)
 """

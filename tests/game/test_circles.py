@@ -20,7 +20,7 @@ from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import PAIR_FEATURES, Source, pair_feature
 from epo_lightning.registry import ConfigError
 from epo_lightning.solvers.backward import Implicit, Unrolled
-from epo_lightning.solvers.gauss_newton import structured
+from epo_lightning.solvers.gauss_newton.backends import pytorch
 from epo_lightning.solvers.gauss_newton.expansion import expand
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
@@ -311,7 +311,7 @@ def test_samples_depend_on_neither_batch_nor_padding_to_the_last_bit():
     def result(scene, parameters, chosen=slice(None)):
         leaves = leaves_of(parameters)
         damping = torch.full(leaves.initial_controls.shape[:2], 10.0)
-        solution = structured.solve(energy, scene, leaves, 2, 0.3, damping)
+        solution = pytorch.solve(energy, scene, leaves, 2, 0.3, damping)
         assert (solution.status == Status.COMPLETED).all()
         solution.states[:, :, :4].square().sum().backward()
         by = [leaves.initial_controls.grad, leaves.goals.grad, *(leaves.own_weights[name].grad for name in OWN)]

@@ -16,8 +16,8 @@ from torch.autograd.function import once_differentiable
 from epo_lightning.forecast import Status
 from epo_lightning.solvers.feedback.anderson import DEPENDENT
 from epo_lightning.solvers.feedback.iteration import LARGEST_MOVE, REMEMBERED, SHORTEST, TRIALS, FeedbackGame
-from epo_lightning.solvers.gauss_newton import compiled
-from epo_lightning.solvers.gauss_newton.game_arrays import GameArrays
+from epo_lightning.solvers.gauss_newton.backends import compiled
+from epo_lightning.solvers.gauss_newton.backends.game_arrays import GameArrays
 from epo_lightning.solvers.gauss_newton.kernel import interface
 from epo_lightning.solvers.gauss_newton.kernel.interface import EpoFeedback
 

@@ -17,7 +17,7 @@ from epo_lightning.forecast import GameParameters, Solution, Status
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.host import readable
 from epo_lightning.scene import Scene
-from epo_lightning.solvers.gauss_newton.structured import LEAST_DAMPING, MOST_DAMPING
+from epo_lightning.solvers.gauss_newton.backends.pytorch import LEAST_DAMPING, MOST_DAMPING
 from epo_lightning.solvers.general.descent import wide
 
 _SMALL = 1e-4

@@ -18,9 +18,9 @@ from epo_lightning.forecast import GameParameters, Status
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.host import readable
 from epo_lightning.scene import Scene
-from epo_lightning.solvers.gauss_newton import backends
+from epo_lightning.solvers.gauss_newton.backends import choice
+from epo_lightning.solvers.gauss_newton.backends.pytorch import Game, factorise, planar
 from epo_lightning.solvers.gauss_newton.expansion import expand
-from epo_lightning.solvers.gauss_newton.structured import Game, factorise, planar
 from epo_lightning.solvers.general import descent
 
 
@@ -44,8 +44,8 @@ def attach(
         controls, and a :class:`~epo_lightning.forecast.Status`: STOPPED where H is not positive definite, so that the
         controls are no minimum; such a problem has a gradient of zero.
     """
-    chosen = backends.choose(backend, energy, scene, dataclasses.replace(parameters, initial_controls=controls))
-    kernel = backends.with_kernel(chosen)
+    chosen = choice.choose(backend, energy, scene, dataclasses.replace(parameters, initial_controls=controls))
+    kernel = choice.with_kernel(chosen)
     if kernel is not None:
         return kernel.attach(energy, scene, parameters, controls, exact)
     none = controls.new_zeros(controls.shape[:2]).flatten()

@@ -22,7 +22,8 @@ from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError, register
 from epo_lightning.scene import Scene
 from epo_lightning.solvers.base import PATH, STATIONARY, STEPS, Stepwise
-from epo_lightning.solvers.gauss_newton import adaptive, backends
+from epo_lightning.solvers.gauss_newton import adaptive
+from epo_lightning.solvers.gauss_newton.backends import choice
 from epo_lightning.solvers.general import descent
 
 LARGEST_DAMPING = 1e30
@@ -59,7 +60,7 @@ class LevenbergMarquardt(Stepwise):
             they converge quadratically, and Gauss-Newton steps linearly. They have no derivative of their own: use
             ``backward=implicit`` or ``detached``.
         backend: ``pytorch``; ``compiled``, the kernel for CPUs; ``host``, the same kernel, also for tensors on a GPU, which
-            are copied; ``warp``, fused kernels on a GPU; or ``auto``, the choice of :func:`.backends.choose`.
+            are copied; ``warp``, fused kernels on a GPU; or ``auto``, the choice of :func:`.choice.choose`.
     """
 
     needs_from_energy = frozenset({FEATURES})
@@ -88,7 +89,7 @@ class LevenbergMarquardt(Stepwise):
                 f"solver.damping must be {LARGEST_DAMPING:g} or less, not {self.damping:g}: its products leave the range of "
                 "single precision"
             )
-        check_choice("solver.backend", self.backend, backends.NAMES)
+        check_choice("solver.backend", self.backend, choice.NAMES)
         if self.backend == "warp" and self.newton_steps:
             raise ConfigError(
                 "solver.backend=warp has no Newton steps: set solver.newton_steps=0, or choose solver.backend=auto, "
@@ -103,7 +104,7 @@ class LevenbergMarquardt(Stepwise):
     @property
     def on_host(self) -> bool:
         """Whether the backend solves games on a GPU on the host."""
-        return backends.on_host(self.backend, fixed=not self.adaptive)
+        return choice.on_host(self.backend, fixed=not self.adaptive)
 
     def for_test(self) -> Stepwise:
         """The solver to use outside training."""
@@ -174,10 +175,10 @@ class LevenbergMarquardt(Stepwise):
         if start.numel() == 0:
             return descent.nothing(start), damping
         fixed = not self.adaptive and not exact
-        backend, size = backends.choose(self.backend, energy, scene, parameters, fixed), self.step_size
+        backend, size = choice.choose(self.backend, energy, scene, parameters, fixed), self.step_size
         if not self.adaptive:
             return backend.solve(energy, scene, parameters, steps, size, damping, self.keep_iterates, exact), damping
-        kernel = backends.with_kernel(backend)
+        kernel = choice.with_kernel(backend)
         if kernel is not None and not torch.is_grad_enabled() and not self.keep_iterates:
             return kernel.descend(energy, scene, parameters, steps, size, damping, exact)
         return adaptive.descend_by_calls(

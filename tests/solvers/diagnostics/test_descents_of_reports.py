@@ -21,7 +21,7 @@ from epo_lightning.game.pairs import pairs
 from epo_lightning.metrics.forecast import equilibrium_values
 from epo_lightning.solvers.diagnostics import quasi_newton
 from epo_lightning.solvers.diagnostics.equilibrium import Descent, equilibrium
-from epo_lightning.solvers.gauss_newton import compiled, structured
+from epo_lightning.solvers.gauss_newton.backends import compiled, pytorch
 from epo_lightning.solvers.gauss_newton.kernel import interface
 
 SLOW = settings(max_examples=12, suppress_health_check=[HealthCheck.differing_executors])
@@ -114,7 +114,7 @@ def test_infinitely_expensive_choices_have_infinite_gaps():
 SOLVERS = [compiled.solve] if not isinstance(interface.find(), str) else []
 
 
-SOLVERS += [structured.solve, lambda *a, **o: structured.solve(*a, split=False, **o)]
+SOLVERS += [pytorch.solve, lambda *a, **o: pytorch.solve(*a, split=False, **o)]
 
 
 def reduced(energy, scene, parameters, steps, step_size, damping, held):
@@ -139,7 +139,7 @@ def reduced(energy, scene, parameters, steps, step_size, damping, held):
     return controls
 
 
-@pytest.mark.parametrize("solve", SOLVERS, ids=["compiled", "structured", "whole"][-len(SOLVERS) :])
+@pytest.mark.parametrize("solve", SOLVERS, ids=["compiled", "pytorch", "whole"][-len(SOLVERS) :])
 @pytest.mark.parametrize(("agents", "size"), [(1, 1.0), (2, 2.0), (4, 1.5), (5, 3.0)])
 def test_held_agents_keep_their_controls_while_the_others_are_solved(solve, agents, size):
     scene = random_scene(3, agents, history=2, size=size, dtype=torch.float64)
@@ -166,7 +166,7 @@ def test_held_agents_keep_their_controls_while_the_others_are_solved(solve, agen
         torch.testing.assert_close(mine, other, rtol=1e-8, atol=1e-8, msg=name)
 
 
-@pytest.mark.parametrize("solve", SOLVERS, ids=["compiled", "structured", "whole"][-len(SOLVERS) :])
+@pytest.mark.parametrize("solve", SOLVERS, ids=["compiled", "pytorch", "whole"][-len(SOLVERS) :])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_equal_dampings_of_all_agents_equal_one_damping_bit_for_bit(solve, dtype):
     scene = random_scene(5, 3, history=2, size=1.5, dtype=dtype)

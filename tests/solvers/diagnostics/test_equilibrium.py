@@ -18,8 +18,8 @@ from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import KINDS as KINDS_OF_AGENTS
 from epo_lightning.scene import Scene
 from epo_lightning.solvers.diagnostics.equilibrium import equilibrium
-from epo_lightning.solvers.gauss_newton import backends
 from epo_lightning.solvers.gauss_newton.augmented_lagrangian import AugmentedLagrangian
+from epo_lightning.solvers.gauss_newton.backends import choice
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
 KINDS = pytest.mark.parametrize("kind", [lambda energy: energy, Opaque], ids=["features", "any"])
@@ -289,7 +289,7 @@ def test_games_unknown_to_the_kernel_are_supported():
     scene = random_scene(2, 2, history=2, size=2.0, dtype=torch.float64)
     parameters = random_game(scene, 1, 4, own=OWN)
     energy = FeatureEnergy(OWN, ["proximity"], dynamics=Unicycle("heun"))
-    backends.say_once.cache_clear()
+    choice.say_once.cache_clear()
     with pytest.warns(UserWarning, match="compiled"):
         found = report(energy, scene, parameters, parameters.initial_controls)
     torch.testing.assert_close(found.energy, energy(scene, parameters, parameters.initial_controls)[:, 0])

@@ -16,7 +16,8 @@ from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import Scene
 from epo_lightning.solvers.backward import Implicit, Unrolled
-from epo_lightning.solvers.gauss_newton import adaptive, compiled, structured
+from epo_lightning.solvers.gauss_newton import adaptive
+from epo_lightning.solvers.gauss_newton.backends import compiled, pytorch
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
 PAIR = ("proximity", "clearance")
@@ -54,7 +55,7 @@ def test_a_newton_step_is_the_same_in_both_backends(seed, agents, own, pair, end
     lambda_ = torch.full((3, 2), damping, dtype=torch.float64)
     found = [
         solve(energy, scene, game, 1, 0.7, lambda_, exact=True, **more)
-        for solve, more in ((structured.solve, {"split": True}), (compiled.solve, {}))
+        for solve, more in ((pytorch.solve, {"split": True}), (compiled.solve, {}))
     ]
     # A matrix that is not positive definite is damped more, for all agents that are factorised together. For pair features
     # of states, the two backends find other sets of these agents.
@@ -162,7 +163,7 @@ def test_without_a_gradient_scenes_at_a_minimum_take_no_further_steps(exact) -> 
     def step(rows: torch.Tensor | slice, controls: torch.Tensor, damping: torch.Tensor):
         sizes.append(len(damping))
         some = dataclasses.replace(game[rows], initial_controls=controls)
-        return structured.solve(energy, scene[rows], some, 1, 1.0, damping, exact=exact)
+        return pytorch.solve(energy, scene[rows], some, 1, 1.0, damping, exact=exact)
 
     with torch.no_grad():
         start, damping = solver.run(energy, scene, game, 0)
@@ -185,7 +186,7 @@ def test_a_step_that_changes_nothing_shows_a_minimum_only_with_little_damping() 
         nonlocal taken
         taken += 1
         some = dataclasses.replace(game[rows], initial_controls=controls)
-        return structured.solve(energy, scene[rows], some, 1, 1.0, damping)
+        return pytorch.solve(energy, scene[rows], some, 1, 1.0, damping)
 
     with torch.no_grad():
         start, _ = solver.run(energy, scene, game, 0)

@@ -9,7 +9,7 @@ import torch
 from games import random_game, random_scene
 
 from epo_lightning.game.feature_energy import FeatureEnergy
-from epo_lightning.solvers.gauss_newton import compiled
+from epo_lightning.solvers.gauss_newton.backends import compiled
 from epo_lightning.solvers.gauss_newton.kernel import interface
 
 if isinstance(interface.find(), str):

@@ -5,5 +5,5 @@ game (`games`): the `trajectories`, then backwards in time the costs of a few st
 `expansion`) at their `places`, and the recursion over them (`recursion`), with their sums (`totals`); for the adjoint the
 way back (`trajectories`, `pair_adjoint`, `position_adjoint`, `adjoint`, `products`). `layout` says which arrays are in
 shared memory. Warp compiles the same source for CPUs, where a game has one thread. See
-:mod:`epo_lightning.solvers.gauss_newton.fused` for the backend.
+:mod:`epo_lightning.solvers.gauss_newton.backends.warp` for the backend.
 """

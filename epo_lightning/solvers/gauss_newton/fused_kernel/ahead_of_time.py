@@ -16,7 +16,7 @@ from pathlib import Path
 
 import torch
 
-from epo_lightning.solvers.gauss_newton import fused
+from epo_lightning.solvers.gauss_newton.backends import warp as backend
 from epo_lightning.solvers.gauss_newton.fused_kernel.constants import TEAM, WARP
 from epo_lightning.solvers.gauss_newton.fused_kernel.features import Features
 from epo_lightning.warp_kernels import warp
@@ -58,7 +58,7 @@ def compile_for(architecture: int, double: bool, agents: int, games: int, folder
     """
     wp = warp()
     dtype, device = torch.float64 if double else torch.float32, torch.device("cuda")
-    kernels = fused.kernels(dtype, agents, STEPS, games, device, HIGHWAY)
+    kernels = backend.kernels(dtype, agents, STEPS, games, device, HIGHWAY)
     found = {}
     for name in ("solve", "differentiate"):
         module = getattr(kernels, name).module
@@ -120,11 +120,11 @@ def main(given: Sequence[str] | None = None) -> None:
     print("| arch | numbers | agents | threads | kernel | registers | stack [B] | shared [B] | code [kB] |")
     print("|---|---|---|---|---|---|---|---|---|")
     for architecture, double, agents, games in itertools.product(
-        arguments.arch, (False, True), fused.SIZES, (fused.FEW, fused.FEW + 1)
+        arguments.arch, (False, True), backend.SIZES, (backend.FEW, backend.FEW + 1)
     ):
         with tempfile.TemporaryDirectory() as folder:
             found = compile_for(architecture, double, agents, games, Path(folder))
-        threads = TEAM if games <= fused.FEW else WARP
+        threads = TEAM if games <= backend.FEW else WARP
         for name, r in found.items():
             numbers = "float64" if double else "float32"
             what = f"sm_{architecture} | {numbers} | up to {agents} | {threads} | {name}"

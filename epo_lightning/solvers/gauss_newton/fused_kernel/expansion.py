@@ -10,6 +10,7 @@ from typing import Any, no_type_check
 import warp as wp
 
 from epo_lightning.game.features import WHEELBASE
+from epo_lightning.solvers.gauss_newton.backends.pytorch import LEAST_RAISED_DAMPING
 from epo_lightning.solvers.gauss_newton.fused_kernel.constants import (
     ACC,
     ACCB,
@@ -52,7 +53,6 @@ from epo_lightning.solvers.gauss_newton.fused_kernel.constants import (
     Y,
 )
 from epo_lightning.solvers.gauss_newton.fused_kernel.layout import Fast
-from epo_lightning.solvers.gauss_newton.structured import LEAST_RAISED_DAMPING
 
 
 @no_type_check

@@ -6,6 +6,7 @@ from typing import no_type_check
 
 import warp as wp
 
+from epo_lightning.solvers.gauss_newton.backends.pytorch import RETRIES
 from epo_lightning.solvers.gauss_newton.fused_kernel import adjoint as adjoints
 from epo_lightning.solvers.gauss_newton.fused_kernel import expansion as expansions
 from epo_lightning.solvers.gauss_newton.fused_kernel import games as all_games
@@ -23,7 +24,6 @@ from epo_lightning.solvers.gauss_newton.fused_kernel import trajectories as all_
 from epo_lightning.solvers.gauss_newton.fused_kernel.constants import COMPLETED, DAMPED, PAIRS, STOPPED, TEAM, WARP
 from epo_lightning.solvers.gauss_newton.fused_kernel.features import Features
 from epo_lightning.solvers.gauss_newton.kernel.interface import OWN
-from epo_lightning.solvers.gauss_newton.structured import RETRIES
 
 REGISTERS = {WARP: 128, TEAM: 255}
 """Registers of a thread on a GPU, at most. With 128, some numbers are in local memory, but twice as many games are solved at

@@ -12,8 +12,13 @@ import functools
 from epo_lightning.forecast import Status
 from epo_lightning.game import circles, vehicles
 from epo_lightning.game.features import SLOWEST_STEERING, WHEELBASE
+from epo_lightning.solvers.gauss_newton.backends.pytorch import (
+    LEAST_DAMPING,
+    LEAST_RAISED_DAMPING,
+    MOST_DAMPING,
+    RETRIES,
+)
 from epo_lightning.solvers.gauss_newton.kernel.build import load
-from epo_lightning.solvers.gauss_newton.structured import LEAST_DAMPING, LEAST_RAISED_DAMPING, MOST_DAMPING, RETRIES
 
 OWN = (
     "goal",

@@ -15,23 +15,23 @@ from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import PAIR_FEATURES
 from epo_lightning.registry import ConfigError
-from epo_lightning.solvers.gauss_newton import backends, fused, structured
+from epo_lightning.solvers.gauss_newton.backends import choice, pytorch, warp
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
-warp = pytest.importorskip("warp", reason="NVIDIA Warp is not installed: pip install 'epo_lightning[gpu]'")
+wp = pytest.importorskip("warp", reason="NVIDIA Warp is not installed: pip install 'epo_lightning[gpu]'")
 from epo_lightning.solvers.gauss_newton.fused_kernel import ahead_of_time, kernels
 from epo_lightning.solvers.gauss_newton.fused_kernel.features import Features
 from epo_lightning.solvers.gauss_newton.fused_kernel.layout import fast
 
 
 class TestFused(BackendSuite):
-    solve = staticmethod(fused.solve)
+    solve = staticmethod(warp.solve)
 
 
 def assert_same_as_pytorch(energy, scene, game, damping, steps=3):
     ours, theirs = leaves_of(game), leaves_of(game)
-    found = fused.solve(energy, scene, ours, steps, 0.3, damping, keep_iterates=True)
-    expected = structured.solve(energy, scene, theirs, steps, 0.3, damping, keep_iterates=True)
+    found = warp.solve(energy, scene, ours, steps, 0.3, damping, keep_iterates=True)
+    expected = pytorch.solve(energy, scene, theirs, steps, 0.3, damping, keep_iterates=True)
     for name in ("controls", "states", "initial_energy", "energy", "gradient_norm", "status"):
         torch.testing.assert_close(getattr(found, name), getattr(expected, name), rtol=1e-9, atol=1e-9, msg=name)
     weigh = torch.randn_like(expected.states)
@@ -50,8 +50,8 @@ def assert_same_as_pytorch(energy, scene, game, damping, steps=3):
 def test_games_of_different_lengths_are_those_of_pytorch(pair, agents, threads, monkeypatch):
     """With absent agents, fixed margins, strides and lines that slide, also with a GPU's places in fast memory."""
     if threads is not None:
-        made = functools.partial(kernels.make, True, fused.size_for(agents), None, 6, threads)
-        monkeypatch.setattr(fused, "kernels", lambda *_: made())
+        made = functools.partial(kernels.make, True, warp.size_for(agents), None, 6, threads)
+        monkeypatch.setattr(warp, "kernels", lambda *_: made())
     scene = random_scene(4, agents, history=2, size=1.5, dtype=torch.float64)
     scene.size[..., 1] *= 0.4
     scene.agent_mask[1, 0] = False
@@ -84,10 +84,10 @@ def test_the_threads_of_a_game_need_no_barrier_that_is_missing(backwards, monkey
     game, damping = random_game(scene, 1, 5, pair=pair), torch.full((3, 1), 10.0, dtype=torch.float64)
     results = []
     for block in (False, True):
-        monkeypatch.setattr(warp.config, "enable_cpu_blocks", block)
-        monkeypatch.setattr(fused, "kernels", lambda *_, b=block: kernels.make(True, 8, backwards=backwards and b))
+        monkeypatch.setattr(wp.config, "enable_cpu_blocks", block)
+        monkeypatch.setattr(warp, "kernels", lambda *_, b=block: kernels.make(True, 8, backwards=backwards and b))
         leaves = leaves_of(game)
-        solution = fused.solve(energy, scene, leaves, 2, 0.3, damping, keep_iterates=True)
+        solution = warp.solve(energy, scene, leaves, 2, 0.3, damping, keep_iterates=True)
         (solution.states.square().sum() + solution.iterates[1].square().sum()).backward()
         results.append((solution, gradients(leaves)))
     (one, by_one), (many, by_many) = results
@@ -102,7 +102,7 @@ def test_the_host_does_not_wait_for_the_device():
     scene = dataclasses.replace(scene, game_steps=torch.tensor([7, 2, 5]))
     leaves = leaves_of(random_game(scene))
     with HostMustNotWait():
-        fused.solve(energy, scene, leaves, 2, 0.3, torch.full((3, 2), 10.0)).states.sum().backward()
+        warp.solve(energy, scene, leaves, 2, 0.3, torch.full((3, 2), 10.0)).states.sum().backward()
     assert leaves.initial_controls.grad.isfinite().all()
 
 
@@ -119,7 +119,7 @@ def test_the_backend_warp_takes_the_steps_of_the_layer():
     reference = game.reference.clone()
     reference[1, 0, 1] = 99
     game, energy = dataclasses.replace(game, reference=reference), FeatureEnergy(["lane", "acc", "turnr"])
-    solution = fused.solve(energy, scene, game, 2, 0.3, torch.full((3, 2), 10.0, dtype=torch.float64))
+    solution = warp.solve(energy, scene, game, 2, 0.3, torch.full((3, 2), 10.0, dtype=torch.float64))
     assert solution.status.tolist() == [[0, 0], [Status.STOPPED, 0], [0, 0]], "a line that does not exist"
 
 
@@ -129,30 +129,30 @@ def test_games_that_the_kernels_do_not_solve_are_refused(monkeypatch):
     with pytest.raises(
         ValueError, match="backend is 'warp', but the fused layer integrates by euler, not heun; 'auto' and"
     ):
-        backends.choose("warp", energy, scene, game)
+        choice.choose("warp", energy, scene, game)
     wide = random_scene(1, 9, history=2)
-    assert "up to 8 agents, not 9" in fused.obstacle(FeatureEnergy(["acc"]), wide, random_game(wide, own=("acc",)))
-    monkeypatch.setattr(fused, "LONGEST", 2 * game.initial_controls.numel() - 1)
-    assert "this batch has too many: split it" in fused.obstacle(FeatureEnergy(["acc"]), scene, game)
+    assert "up to 8 agents, not 9" in warp.obstacle(FeatureEnergy(["acc"]), wide, random_game(wide, own=("acc",)))
+    monkeypatch.setattr(warp, "LONGEST", 2 * game.initial_controls.numel() - 1)
+    assert "this batch has too many: split it" in warp.obstacle(FeatureEnergy(["acc"]), scene, game)
     monkeypatch.undo()
-    assert "not torch.float16" in fused.obstacle(FeatureEnergy(["acc"]), scene, game.to(torch.float16))
+    assert "not torch.float16" in warp.obstacle(FeatureEnergy(["acc"]), scene, game.to(torch.float16))
     with pytest.raises(ValueError, match=r"no Newton steps; 'compiled', 'host' .on a GPU. and 'pytorch' have them"):
-        fused.solve(FeatureEnergy(["acc"]), scene, game, 1, 1.0, torch.ones(2, 2), exact=True)
+        warp.solve(FeatureEnergy(["acc"]), scene, game, 1, 1.0, torch.ones(2, 2), exact=True)
     with pytest.raises(ConfigError, match=r"solver\.backend=warp has no Newton steps: set solver\.newton_steps=0"):
         LevenbergMarquardt(backend="warp", adaptive=True, newton_steps=2)
-    monkeypatch.setattr(fused, "installed", lambda: False)
+    monkeypatch.setattr(warp, "installed", lambda: False)
     with pytest.raises(ValueError, match=r"the fused layer needs NVIDIA Warp: pip install 'epo_lightning\[gpu\]'"):
-        backends.choose("warp", FeatureEnergy(["acc"]), scene, game)
+        choice.choose("warp", FeatureEnergy(["acc"]), scene, game)
 
 
 @pytest.mark.parametrize("architecture", [pytest.param(80, marks=pytest.mark.slow), 90])
-@pytest.mark.parametrize("games", [pytest.param(fused.FEW, marks=pytest.mark.slow), fused.FEW + 1])
+@pytest.mark.parametrize("games", [pytest.param(warp.FEW, marks=pytest.mark.slow), warp.FEW + 1])
 def test_machine_code_for_gpus_is_made_without_one(architecture, games, tmp_path):
     found = ahead_of_time.compile_for(architecture, False, 4, games, tmp_path)
     for name, resources in found.items():
         assert 32 < resources.registers <= 255, name
         assert resources.stack < 1024, "values that do not fit into registers"
-        threads = kernels.TEAM if games <= fused.FEW else kernels.WARP
+        threads = kernels.TEAM if games <= warp.FEW else kernels.WARP
         needed = 4 * fast(4, 9, 1, 20, False, threads).numbers
         assert needed <= resources.shared <= needed + 2048, "all functions of a game have one array in shared memory"
         assert 10_000 < resources.code < 128 * 1024, "more code makes threads wait for instructions"
@@ -182,7 +182,7 @@ def test_kernels_that_differ_in_constants_are_not_taken_for_each_other():
 @pytest.mark.slow
 def test_the_largest_games_in_double_precision_fit_into_the_memory_of_a_multiprocessor(tmp_path):
     """Their arrays are in global memory; for the sum of all functions' arrays, ptxas has 48 kB of shared memory."""
-    for resources in ahead_of_time.compile_for(90, True, fused.SIZES[-1], fused.FEW, tmp_path).values():
+    for resources in ahead_of_time.compile_for(90, True, warp.SIZES[-1], warp.FEW, tmp_path).values():
         assert resources.shared < 4096
 
 
@@ -191,7 +191,7 @@ def test_the_largest_games_in_double_precision_fit_into_the_memory_of_a_multipro
     ("agents", "pair"), [*((agents, tuple(PAIR_FEATURES)) for agents in (2, 3, 8)), (8, ("proximity",))]
 )
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("scenes", [fused.FEW // 2, fused.FEW])
+@pytest.mark.parametrize("scenes", [warp.FEW // 2, warp.FEW])
 def test_a_gpu_gets_the_results_of_pytorch_on_a_cpu_also_in_a_cuda_graph(agents, pair, dtype, scenes):
     """The numbers of agents, of pair features and of games choose the kernels, and what is in shared memory."""
     scene = random_scene(scenes, agents, history=2, size=1.5, dtype=dtype)
@@ -206,7 +206,7 @@ def test_a_gpu_gets_the_results_of_pytorch_on_a_cpu_also_in_a_cuda_graph(agents,
         leaves = [game.initial_controls, *game.own_weights.values(), *game.pair_weights.values()]
         return solution, torch.autograd.grad(solution.states.square().sum(), leaves)
 
-    expected, exact = both(structured.solve, scene, theirs)
+    expected, exact = both(pytorch.solve, scene, theirs)
     tolerance = 1e-3 if dtype == torch.float32 else 1e-9
 
     def check(found, by):
@@ -220,11 +220,11 @@ def test_a_gpu_gets_the_results_of_pytorch_on_a_cpu_also_in_a_cuda_graph(agents,
     side = torch.cuda.Stream()
     with torch.cuda.stream(side):
         for _ in range(3):
-            check(*both(fused.solve, there, ours))
+            check(*both(warp.solve, there, ours))
     torch.cuda.current_stream().wait_stream(side)
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph, stream=side):
-        captured = both(fused.solve, there, ours)
+        captured = both(warp.solve, there, ours)
     for _ in range(2):
         graph.replay()
         torch.cuda.synchronize()

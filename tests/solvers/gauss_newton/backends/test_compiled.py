@@ -22,7 +22,7 @@ from games import ALL, BOUNDS, leaves_of, nearest_points_held, random_game, rand
 from epo_lightning.forecast import Status
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.feature_energy import FeatureEnergy
-from epo_lightning.solvers.gauss_newton import backends, compiled, structured
+from epo_lightning.solvers.gauss_newton.backends import choice, compiled, pytorch
 from epo_lightning.solvers.gauss_newton.kernel import build, interface
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
@@ -161,7 +161,7 @@ def test_the_layer_uses_the_kernel_or_warns_once(monkeypatch):
     torch.testing.assert_close(by_default, plain, rtol=0, atol=1e-4)
 
     monkeypatch.setattr(interface, "find", lambda: "it was not built")
-    backends.say_once.cache_clear()
+    choice.say_once.cache_clear()
     with pytest.warns(
         UserWarning, match="the compiled layer is missing: it was not built.*Plain PyTorch does the same"
     ):
@@ -239,7 +239,7 @@ def test_a_step_is_as_exact_as_its_matrix_allows():
             * (singular[..., 0] / singular[..., -1]).square()
             * step.abs().amax((2, 3, 4))
         )
-        for solve, most in ((compiled.solve, 5.0), (structured.solve, 1000.0)):
+        for solve, most in ((compiled.solve, 5.0), (pytorch.solve, 1000.0)):
             found = solve(energy, scene, parameters, 1, 1.0, raised).controls
             assert ((found - start - step).abs().amax((2, 3, 4)) / unit).max() < most
         parameters = dataclasses.replace(parameters, initial_controls=start + step)

@@ -26,7 +26,7 @@ from torch.autograd.function import once_differentiable
 from epo_lightning.forecast import GameParameters, Solution
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import Scene
-from epo_lightning.solvers.gauss_newton import assisted, compiled
+from epo_lightning.solvers.gauss_newton.backends import assisted, compiled
 
 
 @runtime_checkable

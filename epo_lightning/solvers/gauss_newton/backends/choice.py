@@ -1,9 +1,9 @@
 """The implementations of damped steps, and the choice of one of them for a game.
 
 - ``compiled``: the kernel for CPUs (:mod:`.compiled`). PyTorch helps it with features of the user (:mod:`.assisted`).
-- ``host``: the same kernel for games on a GPU, which are copied (:mod:`.hosted`); on a CPU it is ``compiled``.
-- ``warp``: fused kernels on a GPU (:mod:`.fused`).
-- ``pytorch``: operations of PyTorch, anywhere and for every game (:mod:`.structured`).
+- ``host``: the same kernel for games on a GPU, which are copied (:mod:`.host`); on a CPU it is ``compiled``.
+- ``warp``: fused kernels on a GPU (:mod:`.warp`).
+- ``pytorch``: operations of PyTorch, anywhere and for every game (:mod:`.pytorch`).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torch import Tensor
 from epo_lightning.forecast import GameParameters, Solution
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import Scene
-from epo_lightning.solvers.gauss_newton import assisted, compiled, fused, hosted, kernel_games, structured
+from epo_lightning.solvers.gauss_newton.backends import assisted, compiled, host, kernel_games, pytorch, warp
 from epo_lightning.warp_kernels import installed
 
 NAMES = ("auto", "pytorch", "compiled", "host", "warp")
@@ -39,7 +39,7 @@ class Backend(Protocol):
         keep_iterates: bool = False,
         exact: bool = False,
     ) -> Solution:
-        """S steps from the initial controls, as :func:`.structured.solve` takes them.
+        """S steps from the initial controls, as :func:`.pytorch.solve` takes them.
 
         The damping is that of every game [B, M] or agent [B, M, N]. An agent with infinite damping keeps its controls
         exactly; its trajectory is then a constant for the other agents.
@@ -70,7 +70,7 @@ class KernelBackend(Backend, Protocol):
 
 def with_kernel(backend: Backend) -> KernelBackend | None:
     """The backend, if its kernel takes adaptive steps and differentiates minima."""
-    return next((one for one in (compiled, hosted, assisted) if one is backend), None)
+    return next((one for one in (compiled, host, assisted) if one is backend), None)
 
 
 def choose(
@@ -94,17 +94,17 @@ def choose(
         ValueError: the backend of this name cannot solve the game.
     """
     if name == "pytorch":
-        return structured
-    layer, on_cpu = hosted.cpu_layer(energy), parameters.initial_controls.device.type == "cpu"
-    chosen = {"compiled": layer, "host": layer if on_cpu else hosted, "warp": fused}.get(name)
+        return pytorch
+    layer, on_cpu = host.cpu_layer(energy), parameters.initial_controls.device.type == "cpu"
+    chosen = {"compiled": layer, "host": layer if on_cpu else host, "warp": warp}.get(name)
     if chosen is None and on_cpu:
         chosen = layer
     elif chosen is None and fixed and energy.custom is not None:
-        reason = kernel_games.unknown(energy, scene, parameters, fused.SIZES[-1], "the fused layer")
+        reason = kernel_games.unknown(energy, scene, parameters, warp.SIZES[-1], "the fused layer")
         assert reason is not None
         return _replaced(reason)
     elif chosen is None:
-        chosen = fused if fixed and fused.obstacle(energy, scene, parameters) is None else hosted
+        chosen = warp if fixed and warp.obstacle(energy, scene, parameters) is None else host
     obstacle = chosen.obstacle(energy, scene, parameters)
     if obstacle is None:
         return chosen
@@ -117,7 +117,7 @@ def _replaced(reason: str) -> Backend:
     """Plain PyTorch in the place of a kernel, with a warning of the reason."""
     if not torch.compiler.is_exporting():
         say_once(reason)
-    return structured
+    return pytorch
 
 
 def on_host(name: str, fixed: bool) -> bool:

@@ -17,7 +17,8 @@ from epo_lightning.forecast import GameParameters, Status
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import OWN_FEATURES, PAIR_FEATURES, Source, own_feature, pair_feature
 from epo_lightning.scene import ACCELERATION, HEADING, SPEED, TURN_RATE, Scene, X, Y
-from epo_lightning.solvers.gauss_newton import assisted, backends, compiled, implicit, structured
+from epo_lightning.solvers.gauss_newton import implicit
+from epo_lightning.solvers.gauss_newton.backends import assisted, choice, compiled, pytorch
 from epo_lightning.solvers.gauss_newton.kernel import interface
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 from epo_lightning.solvers.general import dense
@@ -95,7 +96,7 @@ def with_twins(energy, scene, parameters, *given, **options):
         margins=exchanged(parameters.margins, PAIR_TWINS),
     )
     helped = assisted.obstacle(energy, scene, parameters) is None
-    return (assisted if helped else structured).solve(energy, scene, parameters, *given, **options)
+    return (assisted if helped else pytorch).solve(energy, scene, parameters, *given, **options)
 
 
 class TestAssisted(BackendSuite):
@@ -209,7 +210,7 @@ def test_newton_steps_equal_those_of_a_dense_hessian(agents, pair, own, stride, 
     torch.testing.assert_close(found.controls, expected, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("backend", [assisted, structured])
+@pytest.mark.parametrize("backend", [assisted, pytorch])
 def test_newton_steps_couple_agents_by_second_derivatives_alone(backend):
     scene = small_scene(2, None)
     scene.history[..., HEADING] = 0.5
@@ -256,10 +257,10 @@ def test_derivatives_of_minima_equal_those_of_dense_matrices(agents, pair, exact
 def test_the_solver_takes_it_for_functions_of_single_steps():
     scene = random_scene(3, 2, history=2)
     energy, parameters = coupled(scene, 8)
-    assert backends.choose("auto", energy, scene, parameters, fixed=True) is assisted
-    assert backends.choose("compiled", energy, scene, parameters) is assisted
-    assert backends.choose("pytorch", energy, scene, parameters) is structured
-    assert backends.choose("auto", FeatureEnergy(["acc"]), scene, parameters) is compiled
+    assert choice.choose("auto", energy, scene, parameters, fixed=True) is assisted
+    assert choice.choose("compiled", energy, scene, parameters) is assisted
+    assert choice.choose("pytorch", energy, scene, parameters) is pytorch
+    assert choice.choose("auto", FeatureEnergy(["acc"]), scene, parameters) is compiled
     found, plain = (LevenbergMarquardt(backend=name)(energy, scene, parameters) for name in ("auto", "pytorch"))
     assert found.controls.dtype == torch.float32
     torch.testing.assert_close(found.controls, plain.controls, rtol=0, atol=5e-5)
@@ -277,7 +278,7 @@ def test_games_that_it_cannot_solve_have_a_reason(own, pair, reason):
     scene = random_scene(2, 2, history=2)
     energy, game = FeatureEnergy(own, pair), random_game(scene)
     with pytest.raises(ValueError, match=rf"solver\.backend is 'compiled', but .*{reason}"):
-        backends.choose("compiled", energy, scene, game)
+        choice.choose("compiled", energy, scene, game)
 
 
 @pytest.mark.parametrize("held", [False, True])

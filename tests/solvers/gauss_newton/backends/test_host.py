@@ -17,7 +17,7 @@ from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import OWN_FEATURES, PAIR_FEATURES, Source, own_feature, pair_feature
 from epo_lightning.scene import SPEED, TURN_RATE
 from epo_lightning.solvers.backward import Implicit
-from epo_lightning.solvers.gauss_newton import assisted, backends, compiled, hosted, structured
+from epo_lightning.solvers.gauss_newton.backends import assisted, choice, compiled, host, pytorch
 from epo_lightning.solvers.gauss_newton.kernel import interface
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
@@ -66,7 +66,7 @@ class Counted:
 
     def to_device(self, tensors):
         assert not any(isinstance(tensor, Remote) for tensor in tensors)
-        packed = torch.cat(hosted._parts(tensors))
+        packed = torch.cat(host._parts(tensors))
         self.copied.append(("to device", packed.numel()))
         return Remote(packed)
 
@@ -95,7 +95,7 @@ def values(tensor):
 def copies(monkeypatch):
     """The copies, and nothing of CUDA."""
     found = Counted()
-    monkeypatch.setattr(hosted, "copies_of", lambda device: found if device.type == "meta" else None)
+    monkeypatch.setattr(host, "copies_of", lambda device: found if device.type == "meta" else None)
     return found
 
 
@@ -127,7 +127,7 @@ class TestHosted(BackendSuite):
     @staticmethod
     def solve(energy, scene, parameters, steps, step_size, damping, keep_iterates=False):
         there, game = scene.map(_Onto.apply), parameters.map(_Onto.apply)
-        found = hosted.solve(energy, there, game, steps, step_size, Remote(damping), keep_iterates)
+        found = host.solve(energy, there, game, steps, step_size, Remote(damping), keep_iterates)
         assert all(isinstance(tensor, Remote) for tensor in (found.controls, found.energy, found.status))
         return found.map(_Back.apply)
 
@@ -142,7 +142,7 @@ def test_results_are_those_of_the_compiled_layer_bit_for_bit(pair, dtype, copies
     damping = torch.full((5, 2), 10.0, dtype=dtype)
     ours, theirs = leaves_of(game), leaves_of(game)
     there = remote(ours)
-    solution = hosted.solve(energy, remote(scene), there, 2, 0.3, Remote(damping), keep_iterates=True)
+    solution = host.solve(energy, remote(scene), there, 2, 0.3, Remote(damping), keep_iterates=True)
     expected = compiled.solve(energy, scene, theirs, 2, 0.3, damping, keep_iterates=True)
     assert [way for way, _ in copies.copied] == ["to host", "to device"]
     for name in ("controls", "states", "initial_energy", "energy", "gradient_norm", "status"):
@@ -161,7 +161,7 @@ def test_only_what_the_kernel_reads_is_copied(copies):
     scene = random_scene(4, 2, history=19, lanes=5)
     energy, game = FeatureEnergy(["acc", "goal"]), random_game(scene, 2, 7)
     with torch.no_grad():
-        hosted.solve(energy, remote(scene), remote(game), 1, 0.3, Remote(torch.ones(4, 2)))
+        host.solve(energy, remote(scene), remote(game), 1, 0.3, Remote(torch.ones(4, 2)))
     agents, floats = 4 * 2, 4
     read = floats * agents * (4 + 2) + 2 * agents  # current states, sizes, two masks
     read += floats * (2 * agents * (2 + 2 + 7 * 2) + 2 * 4 + 2 * 4)  # weights, goals, controls; pairs, damping
@@ -172,7 +172,7 @@ def test_adaptive_and_implicit_solutions_are_those_of_the_compiled_layer(copies)
     scene, energy = random_scene(3, 2, history=2, size=1.0), FeatureEnergy(["goal", "acc", "turnr"])
     game = random_game(scene, 2, 6, spread=0.1)
     minimise = LevenbergMarquardt(20, 1.0, 1.0, adaptive=True, newton_steps=5)
-    assert backends.choose("auto", energy, remote(scene), remote(game)) is hosted
+    assert choice.choose("auto", energy, remote(scene), remote(game)) is host
     assert minimise.on_host
     assert not dataclasses.replace(minimise, backend="pytorch").on_host
     with torch.no_grad(), Factories():
@@ -219,7 +219,7 @@ def test_features_of_the_user_are_evaluated_on_the_host(own_features, copies):
     energy, scene, game = own_features
     ours, theirs, damping = leaves_of(game), leaves_of(game), torch.full((4, 2), 5.0)
     there = remote(ours)
-    found = hosted.solve(energy, remote(scene), there, 2, 0.3, Remote(damping), keep_iterates=True)
+    found = host.solve(energy, remote(scene), there, 2, 0.3, Remote(damping), keep_iterates=True)
     expected = assisted.solve(energy, scene, theirs, 2, 0.3, damping, keep_iterates=True)
     assert [way for way, _ in copies.copied] == ["to host", "to device"]
     for name in ("controls", "states", "initial_energy", "energy", "gradient_norm", "status"):
@@ -252,32 +252,32 @@ def test_minima_with_features_of_the_user_are_found_and_differentiated_on_the_ho
 def test_fixed_steps_with_features_of_the_user_stay_on_the_device(own_features):
     """A CUDA graph can contain them there."""
     energy, scene, game = own_features
-    backends.say_once.cache_clear()
+    choice.say_once.cache_clear()
     with pytest.warns(UserWarning, match="the fused layer does not know the feature 'drift'"):
-        assert backends.choose("auto", energy, remote(scene), remote(game), fixed=True) is structured
-    assert backends.choose("auto", energy, remote(scene), remote(game)) is hosted
-    assert backends.choose("host", energy, remote(scene), remote(game), fixed=True) is hosted
+        assert choice.choose("auto", energy, remote(scene), remote(game), fixed=True) is pytorch
+    assert choice.choose("auto", energy, remote(scene), remote(game)) is host
+    assert choice.choose("host", energy, remote(scene), remote(game), fixed=True) is host
 
 
 def test_the_host_backend_is_for_games_on_a_device_that_the_kernel_knows():
     scene, energy = random_scene(2, 2, history=2), FeatureEnergy(["goal", "acc"])
     game = random_game(scene)
-    assert backends.choose("host", energy, scene, game) is compiled, "a run of a GPU is scored on a machine without one"
+    assert choice.choose("host", energy, scene, game) is compiled, "a run of a GPU is scored on a machine without one"
     with pytest.raises(ValueError, match="backend is 'compiled', but the compiled layer runs on CPUs"):
-        backends.choose("compiled", energy, remote(scene), remote(game))
+        choice.choose("compiled", energy, remote(scene), remote(game))
     heun = FeatureEnergy(["goal", "acc"], dynamics=Unicycle("heun"))
     with pytest.raises(ValueError, match="backend is 'host', but the compiled layer integrates by euler, not heun"):
-        backends.choose("host", heun, remote(scene), remote(game))
-    backends.say_once.cache_clear()
+        choice.choose("host", heun, remote(scene), remote(game))
+    choice.say_once.cache_clear()
     with pytest.warns(UserWarning, match="integrates by euler, not heun"):
-        chosen = backends.choose("auto", heun, remote(scene), remote(game))
-    assert chosen is structured
+        chosen = choice.choose("auto", heun, remote(scene), remote(game))
+    assert chosen is pytorch
 
 
 def test_devices_without_copies_are_named(monkeypatch):
     monkeypatch.undo()
     scene, energy = random_scene(2, 2, history=2).to("meta"), FeatureEnergy(["goal", "acc"])
-    reason = hosted.obstacle(energy, scene, random_game(random_scene(2, 2, history=2)).to("meta"))
+    reason = host.obstacle(energy, scene, random_game(random_scene(2, 2, history=2)).to("meta"))
     assert reason == "the game is copied from CUDA devices, and these tensors are on meta"
 
 

@@ -6,7 +6,7 @@ seven numbers per agent and time step, and nine per pair. The kernel takes them 
 `kernel/game.hpp`), beside its own features. It is called once per step, because they change with the iterate. Newton steps
 also take the second derivatives by the same numbers.
 
-The derivative of a step is that of :mod:`.structured`: with mu, the adjoint of the step, which the kernel returns,
+The derivative of a step is that of :mod:`.pytorch`: with mu, the adjoint of the step, which the kernel returns,
 phi = -<J mu, r + J d> has a part of the kernel's features and one of the user's. PyTorch differentiates the latter. The
 derivative of a minimum (:mod:`.implicit`) is the same with the Hessian and d = 0.
 """
@@ -30,8 +30,9 @@ from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import Source
 from epo_lightning.game.pairs import pairs
 from epo_lightning.scene import Scene
-from epo_lightning.solvers.gauss_newton import adaptive, compiled
-from epo_lightning.solvers.gauss_newton.structured import pullback_undeclared
+from epo_lightning.solvers.gauss_newton import adaptive
+from epo_lightning.solvers.gauss_newton.backends import compiled
+from epo_lightning.solvers.gauss_newton.backends.pytorch import pullback_undeclared
 
 _SOURCES = (Source.CONTROL, Source.SPEED, Source.STEP, Source.DISTANCE)
 """Sources of features with one residual per step, which depends on this step alone."""

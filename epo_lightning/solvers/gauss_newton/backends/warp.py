@@ -20,9 +20,9 @@ from torch import Tensor
 from epo_lightning.forecast import GameParameters, Solution
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import Scene
-from epo_lightning.solvers.gauss_newton import kernel_games
+from epo_lightning.solvers.gauss_newton.backends import kernel_games
+from epo_lightning.solvers.gauss_newton.backends.recorded_steps import take_steps
 from epo_lightning.solvers.gauss_newton.kernel.interface import SIGNALS
-from epo_lightning.solvers.gauss_newton.recorded_steps import take_steps
 from epo_lightning.warp_kernels import described, installed, launch, warp
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def solve(
     keep_iterates: bool = False,
     exact: bool = False,
 ) -> Solution:
-    """S damped Gauss-Newton steps, as :func:`epo_lightning.solvers.gauss_newton.structured.solve` takes them.
+    """S damped Gauss-Newton steps, as :func:`epo_lightning.solvers.gauss_newton.backends.pytorch.solve` takes them.
 
     The solution is differentiable with respect to weights, margins, goals, their headings, reference controls and
     initial controls.

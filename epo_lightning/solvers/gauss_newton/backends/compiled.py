@@ -25,11 +25,11 @@ from torch.autograd.function import once_differentiable
 from epo_lightning.forecast import GameParameters, Solution, Status
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.scene import Scene
-from epo_lightning.solvers.gauss_newton import kernel_games
-from epo_lightning.solvers.gauss_newton.game_arrays import GameArrays, as_type
+from epo_lightning.solvers.gauss_newton.backends import kernel_games
+from epo_lightning.solvers.gauss_newton.backends.game_arrays import GameArrays, as_type
+from epo_lightning.solvers.gauss_newton.backends.recorded_steps import take_steps
 from epo_lightning.solvers.gauss_newton.kernel import interface
 from epo_lightning.solvers.gauss_newton.kernel.interface import MOST_AGENTS, Address, EpoGame, EpoRun
-from epo_lightning.solvers.gauss_newton.recorded_steps import take_steps
 from epo_lightning.solvers.general import descent
 
 
@@ -64,7 +64,7 @@ def solve(
     exact: bool = False,
     threads: int | None = None,
 ) -> Solution:
-    """S damped Gauss-Newton steps, as :func:`epo_lightning.solvers.gauss_newton.structured.solve` takes them.
+    """S damped Gauss-Newton steps, as :func:`epo_lightning.solvers.gauss_newton.backends.pytorch.solve` takes them.
 
     The solution is differentiable with respect to weights, margins, targets and initial controls. Problems are shared out
     among ``threads`` threads, by default ``torch.get_num_threads()``; results do not depend on their number.

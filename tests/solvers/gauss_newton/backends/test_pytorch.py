@@ -18,7 +18,7 @@ from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import OWN_FEATURES, PAIR_FEATURES, Source, own_feature, pair_feature
 from epo_lightning.scene import ACCELERATION, SPEED, TURN_RATE
 from epo_lightning.solvers.backward import Implicit
-from epo_lightning.solvers.gauss_newton import structured
+from epo_lightning.solvers.gauss_newton.backends import pytorch
 from epo_lightning.solvers.gauss_newton.expansion import expand
 from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
@@ -31,11 +31,11 @@ CURVED = {
 
 def solve(energy, scene, parameters, steps=2, damping=10.0, **options):
     damping = parameters.initial_controls.new_full(parameters.initial_controls.shape[:2], damping)
-    return structured.solve(energy, scene, parameters, steps, 0.3, damping, **options)
+    return pytorch.solve(energy, scene, parameters, steps, 0.3, damping, **options)
 
 
 class TestStructured(BackendSuite):
-    solve = staticmethod(structured.solve)
+    solve = staticmethod(pytorch.solve)
 
 
 def dense(energy, scene, parameters, steps=2, damping=10.0):
@@ -157,7 +157,7 @@ def test_components_are_those_of_the_active_pairs():
     parameters.pair_weights["proximity"][:, 1] = 0.0  # no weight, no edge
     energy = FeatureEnergy(["goal"], ["proximity"])
     model = expand(energy, scene, parameters, parameters.initial_controls, every_pair=False)
-    groups = structured._components(model)
+    groups = pytorch._components(model)
     residuals = energy.residuals(scene, parameters, parameters.initial_controls)["proximity"].flatten(0, 1)
     pairs = torch.triu_indices(6, 6, 1).T.tolist()
     expected = set()
