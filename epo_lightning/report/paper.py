@@ -109,7 +109,9 @@ def paper_values(
     split: str = "test",
     steps: int | None = None,
 ) -> dict[str, float]:
-    """The paper's values of a row by metric; empty where the paper has none, as it gives known goals to the energy only.
+    """The paper's values of a row by metric; empty where the paper has none.
+
+    It does not say whether the networks of its rows read given goals; its values stand beside rows whose energies alone do.
 
     Args:
         data: name of the data set (:func:`.runs.data_name`); the paper's values are shown beside any recipe and players.

@@ -62,7 +62,7 @@ class RecordedData(SceneDataModule):
         test_share: share of the groups that is drawn for the test split.
         val_share: share of the remaining recordings or groups that is drawn for the validation split.
         val_by: ``recording`` or ``group``. Windows of one recording are never in two splits.
-        frame: ``aligned`` (x along the agents' mean heading) or ``fixed`` (axes of the recording, as in the paper).
+        frame: ``aligned`` (x along the agents' mean heading) or ``fixed`` (axes of the recording, the paper's).
         shape: agents' outline in the overlap rates, ``box`` or ``disc``.
         scale: length [m] that corresponds to 1 in the inputs of a network.
         root: folder of the cache; None for $EPO_CACHE or ``cache``.

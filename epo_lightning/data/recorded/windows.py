@@ -51,7 +51,7 @@ CHUNK = 4_000_000
 
 @dataclass(frozen=True)
 class WindowConfig:
-    """Selection of the windows of a recording that become scenes. The defaults are the paper's for exiD.
+    """Selection of the windows of a recording that become scenes. The times and the number of agents are by default the paper's for exiD.
 
     Attributes:
         dt: time step [s].
