@@ -9,7 +9,7 @@
 # make checkpoint  train the checkpoints that ship with the package anew (an hour; one: NAME=rpi/v_lstm_epo)
 # make asan        test the kernel with the sanitizers of addresses and undefined behaviour (Clang, Linux)
 # make wheel       build a package for this platform, with the compiled layer, in dist/
-# make clean       remove what these made, except the data in cache/ and the runs in runs/
+# make clean       remove the compiled layer, tables and figures of reports, packages, and caches of tools
 #
 # PyTorch's build for CUDA is the default on Linux and needs 5 GB. Another one, for CPUs say:
 #   TORCH_INDEX=https://download.pytorch.org/whl/cpu make run
@@ -60,7 +60,7 @@ INSTALL_PACKAGES = { $(BIN)/uv pip install -q --python $(BIN)/python $(1) || $(B
 unexport PYTHONDONTWRITEBYTECODE
 
 # $(1): the extras. The layer is compiled on one core while packages are downloaded and unpacked on another.
-# Without a compiler its build fails, and the last line says so.
+# Without a compiler its build fails, and the layer runs in PyTorch; solvers say so when they are used.
 define INSTALL
 @echo "installing into $(VENV): one to five minutes and the download, while the layer is compiled in the background ..."
 $(PYTHON) -m venv $(VENV)
@@ -93,11 +93,10 @@ run: $(INSTALLED)
 	$(EPO) sweep first_table runs=$(RUNS) callbacks.progress=lines hydra/launcher=local
 	$(EPO) report first_table runs=$(RUNS) out=$(OUT)
 	@echo
-	@echo "V-LSTM forecasts each agent by itself, +SC all agents together, +EPO as solutions of a game that it infers: both joint rows must be"
-	@echo "far below V-LSTM, and +EPO below +SC (minSADE, minSFDE in metres; smaller is better). These three rows are trained with a remedy"
-	@echo "against modes that are never taught. The two rows below them have minSADE without the remedy: with so little training it is a coin toss"
-	@echo "whether all modes learn, hence the remedy (docs/rpi_results.md). This was a tenth of the data and eight epochs; all data and twenty epochs take"
-	@echo "a quarter of an hour for each of nine runs:"
+	@echo "V-LSTM forecasts each agent alone, +SC all agents together, +EPO by a game that it infers. Smaller minSADE and minSFDE [m] are better."
+	@echo "Expected in the first three rows: +EPO below +SC, and both far below V-LSTM. These rows are trained with a remedy against modes that are"
+	@echo "never taught (docs/rpi_results.md). The last two rows have no remedy: with so little training, chance decides whether all modes learn."
+	@echo "This was a tenth of the data and eight epochs. All data and twenty epochs take a quarter of an hour for each of nine runs:"
 	@echo "  $(EPO) generate && $(EPO) sweep rpi_relaxed budget=long && $(EPO) report rpi_relaxed"
 
 test: $(TESTABLE)

@@ -34,7 +34,6 @@ ELSEWHERE = (
         "trainer.devices",
         "trainer.share",
         "trainer.threads",
-        "trainer.log_every",
         "trainer.profiler",
         "trainer.graph",
     ),

@@ -246,6 +246,8 @@ class RunFolder:
             ) from error
         if not isinstance(content, dict):
             raise ConfigError(f"{self.config_file} holds no configuration")
+        if isinstance(trainer := content.get("trainer"), dict):
+            trainer.pop("log_every", None)  # in runs of older versions, where it had no effect
         return content
 
     def begin(self, config: Mapping[str, Any], record: Mapping[str, Any]) -> None:

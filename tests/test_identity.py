@@ -50,7 +50,7 @@ def test_settings_that_affect_the_result_change_the_identity(key: str, value: An
         ),
         *(("trainer.threads", 8), ("trainer.devices", 2), ("trainer.accelerator", "gpu"), ("data.root", "/cache")),
         *(("callbacks.progress", "bar"), ("budget", {"name": "other"}), ("experiment", "rpi/other")),
-        *(("trainer.share", 2), ("trainer.graph", True), ("trainer.profiler", True), ("trainer.log_every", 1)),
+        *(("trainer.share", 2), ("trainer.graph", True), ("trainer.profiler", True)),
         *(("callbacks.refresh", 1), ("data.folder", "/recordings")),
     ],
 )

@@ -250,7 +250,7 @@ def build_trainer(
             val_check_interval=between,
             limit_train_batches=settings.limit_train_batches,
             limit_val_batches=settings.limit_val_batches,
-            log_every_n_steps=settings.log_every,
+            log_every_n_steps=0,  # no step is logged by itself, but means of epochs (forecasters/step_means.py)
             deterministic=settings.deterministic,
             callbacks=[*callbacks, *debugging.debug_callbacks(settings, run)],
             logger=list(loggers),

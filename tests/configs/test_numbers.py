@@ -27,7 +27,6 @@ REFUSED = {
     "trainer.validate_steps": (0, -1),
     "trainer.limit_train_batches": (0, -1, 1.5, NAN, INF, -INF),
     "trainer.limit_val_batches": (0, -1, 1.5, NAN, INF),
-    "trainer.log_every": (0, -1),
     "trainer.overfit_batches": (-1,),
     "callbacks.patience": (0, -1, NAN),
     "callbacks.min_delta": (-1.0, NAN, INF),

@@ -39,7 +39,7 @@ def test_the_counts_of_verdicts_are_those_of_the_table() -> None:
     verdicts = re.findall(r"^\| \[\d+ .*?\]\(claims\.md#.*?\) \| ([a-z ]+) \| ", of_the_paper, re.MULTILINE)
     said = "2 hold, 12 hold in part, 2 do not hold, 1 is undecided and 1 is not tested"
     counts = [int(number) for number in re.findall(r"\d+", said)]
-    assert f"Of the paper's {len(verdicts)} claims, {said}." in PAGE
+    assert f"Of these {len(verdicts)} rows, {said}." in PAGE
     wanted = ("holds", "holds in part", "does not hold", "undecided", "not tested")
     assert counts == [verdicts.count(verdict) for verdict in wanted]
 

@@ -154,7 +154,6 @@ def test_a_run_that_validates_after_a_number_of_steps_goes_on_with_the_next_epoc
         "trainer.max_epochs=null",
         "trainer.max_steps=18",
         f"trainer.validate_steps={between}",
-        "trainer.log_every=1",
     )
     kept = without("trainer.max_epochs")
     words = (*kept, *words, "trainer.limit_train_batches=4")

@@ -51,7 +51,9 @@ CHUNK = 4_000_000
 
 @dataclass(frozen=True)
 class WindowConfig:
-    """Selection of the windows of a recording that become scenes. The times and the number of agents are by default the paper's for exiD.
+    """Selection of the windows of a recording that become scenes.
+
+    Times and the number of agents are by default those of the paper for exiD.
 
     Attributes:
         dt: time step [s].
@@ -62,7 +64,8 @@ class WindowConfig:
         radius: largest distance from the focal agent to its neighbours [m]; null for no limit.
         lane_change: whether at least one agent must change lane within the window.
         every: steps between two windows.
-        complete: whether neighbours must be observed in the whole window, like the focal agent, or only at the current step.
+        complete: whether neighbours must be observed in the whole window, like the focal agent, or only at the current
+            step and at the one before.
         smoothing: length [s] of the smoothing filter; null for tracks that are smooth already.
         lanes: largest number of lane polylines L of a scene, the nearest ones; null for all that an agent may reach.
         speed_limit: reference speed [m/s] on lanes without a speed limit.

@@ -39,7 +39,6 @@ class TrainerSettings:
     validate_steps: int | None = None
     limit_train_batches: int | float = 1.0
     limit_val_batches: int | float = 1.0
-    log_every: int = 50
     deterministic: bool = True
     overfit_batches: int = 0
     detect_anomaly: bool = False
@@ -56,7 +55,7 @@ class TrainerSettings:
             )
         if self.max_steps < -1:
             raise ConfigError(f"trainer.max_steps must be 0 or more, or -1 for no limit, not {self.max_steps}")
-        for name in ("share", "validate_every", "log_every"):
+        for name in ("share", "validate_every"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"trainer.{name} must be 1 or more, not {getattr(self, name)}")
         for name in ("threads", "devices"):
