@@ -175,6 +175,10 @@ def test_energies_reweight_probabilities_as_written():
     expected = probabilities * (-0.3 * (energy - energy.amin(1, keepdim=True))).exp()
     assert_close(refined.probabilities, expected / expected.sum(1, keepdim=True))
     assert (energy.amax(1) > energy.amin(1)).all()
+    usual = refine(states, probabilities, scene).probabilities
+    stated = refine(states, probabilities, scene, inverse_temperature=0.03).probabilities
+    assert torch.equal(usual, stated)
+    assert not torch.equal(usual, plain.probabilities)
 
 
 def test_a_mode_without_probability_keeps_none():

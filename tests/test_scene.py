@@ -11,6 +11,7 @@ import torch
 from games import random_scene
 
 from epo_lightning.forecast import GameParameters, JointForecast
+from epo_lightning.scene import FIELDS as DECLARED
 from epo_lightning.scene import Scene
 
 
@@ -171,6 +172,45 @@ def test_only_unmasked_values_must_be_finite():
     assert headed.finite.tolist() == [True, False, True]
     headed.goal_mask[1, 1] = False
     assert headed.finite.all()
+
+
+PADDING = {
+    "history": "history_mask",
+    "future": "future_mask",
+    "goal_candidates": "goal_mask",
+    "goal_headings": "goal_mask",
+    "size": "agent_mask",
+    "lanes": "lane_mask",
+    "references": "reference_mask",
+    "reference_speed": "agent_mask",
+}
+"""For every field of floating-point numbers, the mask that makes its entries padding; frames have none."""
+
+
+def whole_scene() -> Scene:
+    """Two scenes of two agents with every field, all numbers zero and nothing masked."""
+    sizes = dict(zip("BNHKGLVRQ", (2, 2, 3, 4, 2, 2, 3, 2, 3), strict=True))
+    shapes = {name: [sizes.get(str(size), size) for size in shape] for name, (_, shape, _) in DECLARED.items()}
+    masks = {name: torch.ones(shape, dtype=torch.bool) for name, shape in shapes.items() if name.endswith("_mask")}
+    return Scene(dt=0.1, **{name: torch.zeros(shapes[name]) for name in PADDING}, **masks)
+
+
+@pytest.mark.parametrize("field", PADDING)
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf])
+def test_every_field_must_be_finite_where_it_is_no_padding(field: str, bad: float) -> None:
+    scene, last = whole_scene(), -1
+    assert scene.finite.all()
+    values, mask = getattr(scene, field), getattr(scene, PADDING[field])
+    entry = (1, *[last] * (values.dim() - 1))
+    values[entry] = bad
+    assert scene.finite.tolist() == [True, False]
+    mask[entry[: mask.dim()]] = False
+    assert scene.finite.all()
+
+
+def test_the_fields_of_numbers_are_those_that_are_checked() -> None:
+    numbers = {name for name, (kind, _, _) in DECLARED.items() if kind == DECLARED["history"][0]}
+    assert numbers == PADDING.keys() | {"frame"}
 
 
 def test_nested_data_classes_are_indexed_with_the_batch():

@@ -38,6 +38,19 @@ class TestMarginal(ForecasterSuite):
         assert (forecast.agent_probabilities[:, 0] >= forecast.agent_probabilities[:, 1]).all()
         assert (forecast.probabilities[:, 0] >= forecast.probabilities[:, 1]).all()
 
+    def test_the_probability_of_a_joint_mode_is_the_normalised_product_of_the_agents(self):
+        scene = random_scene(3, 2)
+        scene.agent_mask[1, 1] = False
+        forecast = self.forecaster().predict(scene)
+        of_agents, expected = forecast.agent_probabilities.double(), []
+        for row, present in enumerate(scene.agent_mask.tolist()):
+            products = [
+                math.prod(mode[agent] for agent in (0, 1) if present[agent]) for mode in of_agents[row].tolist()
+            ]
+            expected.append([product / sum(products) for product in products])
+        torch.testing.assert_close(forecast.probabilities, torch.tensor(expected))
+        assert (forecast.probabilities[:, 0] > 0.5).all()
+
     def test_heading_and_speed_follow_from_positions(self):
         scene = random_scene(2, 2)
         states = self.forecaster().predict(scene).states

@@ -142,6 +142,19 @@ def test_annealing_trains_all_modes_of_every_row_at_first(name: str) -> None:
     assert counts == {"plain": [2] * 4, "annealed": [4] * 4}
 
 
+@pytest.mark.parametrize("name", LEARNED)
+def test_the_relaxation_trains_all_modes_and_ends_after_its_steps(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At first the gradient of the imitation term reaches all modes, and from then on the closest one of each scene."""
+    scene, forecaster = random_scene(4, 2), build(name)
+    forecast, counts = forecaster(scene), []
+    for step in (0, RELAXED["relaxation_steps"] - 1, RELAXED["relaxation_steps"]):
+        monkeypatch.setattr(type(forecaster), "global_step", step)
+        states = forecast.states.detach().requires_grad_()
+        forecaster.losses(scene, dataclasses.replace(forecast, states=states))["imitation"][1].backward()
+        counts.append((states.grad != 0).flatten(3).any(-1).sum((1, 2)).tolist())  # scene, mode, agent
+    assert counts == [[4] * 4, [4] * 4, [2] * 4]
+
+
 def test_validation_scores_are_those_of_their_own_epoch() -> None:
     forecaster, recorder = build("scene_consistent", optimizer={"name": "adam", "lr": 0.01}), Recorder()
     validation = fit(forecaster, callbacks=[recorder])

@@ -269,5 +269,7 @@ def test_missing_inputs_are_named():
 
 def test_the_configuration_file_states_the_defaults():
     page = yaml.safe_load((Path(__file__).parents[2] / "conf" / "objective" / "conditional.yaml").read_text())
-    assert isinstance(registry.build("objective", page), Conditional)
+    built, default = registry.build("objective", page), Conditional(page["weights"])
+    assert isinstance(built, Conditional)
     assert set(page) == {"name", "weights", "density"}
+    assert vars(built) == vars(default)

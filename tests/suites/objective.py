@@ -81,6 +81,33 @@ class ObjectiveSuite:
             assert value.isfinite()
             assert weight == objective.weights.get(name, 0.0), "what has no weight is for the log alone"
 
+    def test_decoded_goals_are_taught_with_the_weight_of_their_term(self, objective, energy):
+        """The term is the cross entropy with the candidate closest to the last position, where both exist."""
+        if "goal" not in objective.term_names:
+            pytest.skip("this objective has no term for goals")
+        scene, game = self.game(energy)
+        plain = self.forecast(energy, scene, game)
+        candidates, logits = torch.randn(3, 3, 4, 2).double(), torch.randn(3, 3, 4).double()
+        exists = torch.ones(3, 3, 4, dtype=torch.bool)
+        exists[1, 0, 1:], exists[2, 1] = False, False
+        probabilities = torch.where(exists, logits, -torch.inf).softmax(-1).nan_to_num()
+        forecast = dataclasses.replace(plain, goal_probabilities=probabilities, goal_logits=logits)
+        decoded = dataclasses.replace(scene, goal_candidates=candidates, goal_mask=exists)
+        weight, value = objective(decoded, forecast, energy)["goal"]
+        means, nearest = [], set()
+        for b in range(3):
+            taught = [i for i in range(3) if scene.future_mask[b, i, -1] and exists[b, i].any()]
+            closest = {i: self.closest(candidates[b, i], exists[b, i], scene.future[b, i, -1, :2]) for i in taught}
+            nearest |= {*closest.values()}
+            means.append(sum(-float(probabilities[b, i, g].log()) for i, g in closest.items()) / len(taught))
+        assert len(nearest) > 1
+        assert weight == objective.weights["goal"] > 0
+        assert float(value) == pytest.approx(sum(means) / 3)
+
+    @staticmethod
+    def closest(candidates: torch.Tensor, exists: torch.Tensor, final: torch.Tensor) -> int:
+        return min((int(g) for g in exists.nonzero()), key=lambda g: float((candidates[g] - final).norm()))
+
     def test_weights_are_checked_by_name(self, objective):
         weights = dict(objective.weights)
         name = next(iter(self.config["weights"]))

@@ -266,10 +266,10 @@ def test_solvers_declare_numbers_of_candidates_games_and_modes():
 @pytest.mark.parametrize("name", ["enumeration", "sum_product"])
 def test_configuration_files_state_the_defaults(name):
     page = Path(__file__).parents[3] / "conf" / "solver" / f"{name}.yaml"
-    solver = registry.build("solver", yaml.safe_load(page.read_text()))
-    assert set(yaml.safe_load(page.read_text())) - {"name"} == {field.name for field in dataclasses.fields(solver)} - {
-        "modes"
-    }
+    given = yaml.safe_load(page.read_text())
+    solver = registry.build("solver", given)
+    assert set(given) - {"name"} == {field.name for field in dataclasses.fields(solver)} - {"modes"}
+    assert solver == type(solver)(candidates=given["candidates"])
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import platform
 from types import ModuleType
 
 import pytest
@@ -144,6 +145,8 @@ def test_all_levels_of_instructions_agree() -> None:
     game = random_feedback_game()
     library, results = interface.library(), []
     levels = library.epo_levels()
+    if library.epo_built() == 1 and platform.machine() == "x86_64":
+        pytest.skip("the kernel was built for this machine only; build.py --portable builds all levels")
     try:
         for level in range(levels):
             library.epo_choose(level)
