@@ -10,6 +10,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -51,6 +52,20 @@ class GameParameters(Batch):
     margins: Mapping[str, Float[Tensor, "B M P"]] = dataclasses.field(default_factory=dict)
     reference_controls: Float[Tensor, "B M N K 2"] | None = None
 
+    def __post_init__(self) -> None:
+        # Types alone, so that a first mistake on plain tensors has a message; energies check shapes and names.
+        for field in dataclasses.fields(self):
+            value, name = getattr(self, field.name), f"parameters.{field.name}"
+            if field.name in ("own_weights", "pair_weights", "margins"):
+                if not isinstance(value, Mapping):
+                    raise TypeError(
+                        f"{name} is a {type(value).__name__}; it takes a tensor for each feature, {{name: tensor}}"
+                    )
+                for feature, tensor in value.items():
+                    _check_tensor(f"{name}[{feature!r}]", tensor)
+            elif value is not None or field.default is dataclasses.MISSING:
+                _check_tensor(name, value)
+
     def for_every_mode(self, modes: int) -> GameParameters:
         """The same games for M modes: a single game is repeated for all of them. Initial strategies stay unchanged."""
 
@@ -68,6 +83,11 @@ class GameParameters(Batch):
             margins={name: margin.expand(-1, modes, -1) for name, margin in self.margins.items()},
             reference_controls=widen(self.reference_controls),
         )
+
+
+def _check_tensor(name: str, value: Any) -> None:
+    if not isinstance(value, Tensor):
+        raise TypeError(f"{name} is a {type(value).__name__}; it takes a tensor: convert it with torch.as_tensor")
 
 
 class Status(IntEnum):

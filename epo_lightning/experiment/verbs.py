@@ -68,9 +68,17 @@ def generate_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None
         words = [f"experiment={row}", *(word for word in kept if word != f"data={dataset}")]
     else:
         on_lanes = "urban" if settings.data.get("windows", {}).get("lines") else "highway"
-        rows = on_lanes if data.task.map else "dut" if vehicles else "ucy"
+        rows = on_lanes if data.task.map else "dut" if vehicles or has_vehicles(data) else "ucy"
         words = [f"experiment={rows}/v_lstm_epo", *kept]
     print(f"\nnext: epo train {shlex.join(words)} budget=short" + " (minutes; without a budget: the paper's settings)")
+
+
+def has_vehicles(data: Any) -> bool:
+    """Whether some agents of a data set of recordings are no pedestrians."""
+    from epo_lightning.scene import KINDS
+
+    data.setup("fit")
+    return bool((data.dataset("train").tables["kind"] != KINDS.index("pedestrian")).any())
 
 
 def make_data(settings: GenerateSettings, overrides: Sequence[str] = ()) -> Any:

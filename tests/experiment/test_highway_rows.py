@@ -104,8 +104,12 @@ def test_rows_from_recordings_to_the_table(epo: Epo, tmp_path: Path, capsys: pyt
     assert pictures == {".png", ".gif"}
 
 
-def test_the_next_command_for_vehicles_without_a_map_is_accepted(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
-    assert epo("generate", "data=exid", *DATA, "data.map=false", "data.windows.lane_change=false", "workers=1") == 0
+@pytest.mark.parametrize("own", [[], ["data.dataset=mine"]])
+def test_the_next_command_for_vehicles_without_a_map_is_accepted(
+    epo: Epo, capsys: pytest.CaptureFixture[str], own: list[str]
+) -> None:
+    without_map = ["data.map=false", "data.windows.lane_change=false"]
+    assert epo("generate", "data=exid", *DATA, *without_map, *own, "workers=1") == 0
     (following,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("next: ")]
     words = shlex.split(following.removeprefix("next: epo train ").partition(" (")[0])
     assert words[0] == "experiment=dut/v_lstm_epo"

@@ -17,6 +17,7 @@ from epo_lightning.data.recorded.extraction import Extracted
 from epo_lightning.data.recorded.tables import SceneTables
 from epo_lightning.data.recorded.tracks import RecordingSource
 from epo_lightning.data.recorded.windows import AT_ENDS, MOMENTS, REASONS
+from epo_lightning.scene import KINDS
 
 FILE = "recordings.csv"
 """Name of the table in the folder of a data set."""
@@ -50,6 +51,12 @@ def describe(scenes: SceneTables) -> dict[str, Any]:
         "agents per scene": float((scenes.agents >= 0).sum(1).mean()),
         "speed [m/s], 5th and 95th percentile": [float(value) for value in np.percentile(speed, [5, 95])],
     }
+    walks = scenes.kind == KINDS.index("pedestrian")
+    if 0 < walks.sum() < len(walks):  # together, wrong units of one kind could not be seen
+        for name, chosen in (("pedestrians", walks), ("others", ~walks)):
+            found[f"speed of {name} [m/s], 5th and 95th percentile"] = [
+                float(v) for v in np.percentile(speed[chosen], [5, 95])
+            ]
     ends = scenes.future_mask[:, -1]
     if scenes.candidates.shape[1] and ends.any():
         nearest_goal = distance_to_goals(scenes)[ends]

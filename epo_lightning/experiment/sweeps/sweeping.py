@@ -192,10 +192,11 @@ def _listed(sweep: Sweep, words: Sequence[str], extra: Sequence[str], choices: C
     Searching sweeps choose their runs later, and have none here. A time that was measured with other settings is renamed.
 
     Raises:
-        ConfigError: a mistake in a configuration, a folder that holds something else, data that is missing, or runs that no
-            table may compare.
+        ConfigError: a mistake in a configuration, a folder that holds something else, data that is missing, two rows with
+            the same settings, or runs that no table may compare.
     """
     jobs: dict[Path, Job] = {}
+    same: dict[str, Job] = {}
     ready: set[str] = set()
     scored: dict[str, list[dict[str, Any]]] = {}
     for overrides in _overrides_of_runs(words, choices, extra):
@@ -216,6 +217,12 @@ def _listed(sweep: Sweep, words: Sequence[str], extra: Sequence[str], choices: C
         if {*job.measures} - {"time"} and config["forecaster"]["name"] != UNLEARNED:
             scored.setdefault(job.data + fold(config), []).append(config)
         jobs.setdefault(job.run.path, job)
+        twin = same.setdefault(job.identity, job)
+        if twin.run.path != job.run.path:
+            raise ConfigError(
+                f"the rows {twin.title!r} and {job.title!r} have the same settings, so that {twin.run.path} and "
+                f"{job.run.path} would be the same run: change a setting of one row, or leave the row out"
+            )
     for data, configs in scored.items():
         _refuse_incomparable(data, configs)
     return list(jobs.values())

@@ -157,9 +157,14 @@ class LevenbergMarquardt(Stepwise):
                 damping keep their controls.
 
         Raises:
+            TypeError: arguments of other types, or in another order.
             ValueError: scene and parameters do not fit together (the message names the tensor and its expected shape), or
                 the chosen backend cannot solve this game.
         """
+        game = (energy, scene, parameters)
+        if not all(map(isinstance, game, (Energy, Scene, GameParameters))):
+            given = ", ".join(type(argument).__name__ for argument in game)
+            raise TypeError(f"a solver takes an energy, a Scene and GameParameters, in this order, not {given}")
         if not isinstance(energy, FeatureEnergy):
             raise ValueError(
                 f"solver=levenberg_marquardt takes energy=features, not {type(energy).__name__}; choose a general solver"

@@ -23,6 +23,7 @@ from epo_lightning.data.recorded.tables import INDEX_OF, OF_AGENTS, OF_SCENES, S
 from epo_lightning.data.recorded.tracks import Recording, RecordingSource
 from epo_lightning.experiment import generation
 from epo_lightning.registry import ConfigError, register
+from epo_lightning.scene import KINDS
 
 from .roads import FOUR, curve, recording
 
@@ -190,7 +191,7 @@ def tables(draw: np.random.Generator, lanes: int, lines: bool) -> SceneTables:
         values(a, 2, 4),
         draw.random((a, 2)) < 0.5,
         values(a, 2),
-        draw.integers(0, 3, a),
+        draw.choice([KINDS.index("car"), KINDS.index("pedestrian")], a),
         draw.integers(0, 99, a),
         values(a, 4, 2),
         values(a, 2, 5, 2),
@@ -256,6 +257,10 @@ def test_gathered_columns_are_those_joined_in_memory(tmp_path_factory, seed, emp
             np.testing.assert_array_equal(made[name].numpy(), values)
     speed = np.concatenate([part.history[:, -1, 3] for part in full])
     assert about["speed [m/s], 5th and 95th percentile"] == np.percentile(speed, [5, 95]).tolist()
+    walks = np.concatenate([part.kind for part in full]) == KINDS.index("pedestrian")
+    for name, some in (("pedestrians", walks), ("others", ~walks)):
+        shown = about.get(f"speed of {name} [m/s], 5th and 95th percentile")
+        assert shown == (np.percentile(speed[some], [5, 95]).tolist() if 0 < walks.sum() < len(walks) else None)
     counts = [(row >= 0).sum() for part in full for row in part.agents]
     assert about["agents per scene"] == float(np.mean(counts))
     assert set(INDEX_OF.values()) == {"history", "polylines", "origin"}

@@ -255,6 +255,24 @@ def test_runs_that_no_table_may_compare_are_refused_before_they_begin(
     assert f"the runs of this sweep on drawn (rpi) differ in {key}, which must be equal" in said
 
 
+def test_rows_with_the_same_settings_are_refused(tmp_path: Path) -> None:
+    """They would be trained twice, and the report could not tell their runs apart."""
+    own = tmp_path / "own" / "experiment"
+    own.mkdir(parents=True)
+    row = "# @package _global_\ndefaults: [rpi/v_lstm_epo, _self_]\ntitle: {}\nsolver: {{damping: {}}}\n"
+    for name, damping in (("usual", 10.0), ("less", 5.0)):
+        (own / f"{name}.yaml").write_text(row.format(name, damping))
+
+    def listed(*experiments: str) -> int:
+        words = [f"experiment={','.join(experiments)}", "seed=0,1", "data=drawn", "data.like=rpi", "budget=smoke"]
+        sweep = Sweep(tmp_path / "runs" / "sweeps" / "a")
+        return len(_listed(sweep, ["sweeps=rpi_main", "score=val", *words], [str(own.parent)]))
+
+    assert listed("rpi/v_lstm_epo", "less") == 4
+    with pytest.raises(ConfigError, match=r"the rows 'V-LSTM \+ EPO' and 'usual' have the same settings, .* same run"):
+        listed("rpi/v_lstm_epo", "usual")
+
+
 def test_settings_that_a_table_compares_and_times_are_not_refused(tmp_path: Path) -> None:
     words = ["experiment=rpi/v_lstm", "seed=0", "data=drawn", "data.like=rpi", "budget=smoke"]
     for more in (["data.batch_size=8,16", "optimizer.lr=0.1,0.2"], ["score=time", "data.scenes=32,64"]):
