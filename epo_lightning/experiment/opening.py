@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import epo_lightning
+from epo_lightning import pretrained
 from epo_lightning.data.recorded.recordings import RecordedData
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.settings import Settings
@@ -46,7 +47,16 @@ def open_data(run: RunFolder, settings: Settings, batch_size: int | None = None)
     if batch_size is not None and "batch_size" in section:
         section["batch_size"] = batch_size
     data = assembly.build_data(section)
-    data.setup("test")
+    try:
+        data.setup("test")
+    except ConfigError as error:
+        elsewhere = not run.path.resolve().is_relative_to(Path.cwd()) and not pretrained.ships(run.path)
+        if not elsewhere:
+            raise
+        raise ConfigError(
+            f"{error}. The run is in another folder, {run.path}, and its data are searched from this one: give the command "
+            "in the folder in which the run was trained, or set $EPO_CACHE to its folder of data sets"
+        ) from error
     refuse_changed(run, data)
     return data
 

@@ -59,3 +59,19 @@ def test_without_the_key_the_data_set_is_used_with_a_warning(epo: Epo) -> None:
     with pytest.warns(UserWarning, match=said):
         assert epo("train", *ROW, *DATA, "run_dir=run") == 0
     assert (Path("run") / "run.json").is_file()
+
+
+def test_a_run_that_is_scored_from_another_folder_says_where_its_data_are(
+    epo: Epo, refused: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.warns(UserWarning, match="there is no folder data/ucy"):
+        assert epo("train", *ROW, *DATA, "run_dir=run") == 0
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    said = refused("evaluate", f"run={tmp_path / 'run'}")
+    assert (
+        f"The run is in another folder, {tmp_path / 'run'}, and its data are searched from this one: give the" in said
+    )
+    monkeypatch.setenv("EPO_CACHE", str(tmp_path / "cache"))
+    with pytest.warns(UserWarning, match="there is no folder data/ucy"):
+        assert epo("evaluate", f"run={tmp_path / 'run'}") == 0
