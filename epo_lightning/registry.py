@@ -1,5 +1,7 @@
 """Registry of named parts: backbones, energies, solvers, forecasters and others are chosen by name in the configuration.
 
+Metrics are not chosen: all of them are computed.
+
 A part is registered where it is written::
 
     @register("backbone", "v_lstm")
@@ -94,6 +96,7 @@ _HOMES = {
     "format": "data.recorded.formats",
     "forecaster": "forecasters",
     "gate": "decoders",
+    "metric": "metrics",
     "objective": "objectives",
     "optimizer": "optimizers",
     "solver": "solvers",

@@ -31,7 +31,7 @@ from epo_lightning.experiment.config.replaced import keys_of
 from epo_lightning.experiment.config.settings import PARTS, Settings, TrainerSettings
 from epo_lightning.experiment.dashboards import mlflow
 from epo_lightning.forecasters import SUPPLIED, Forecaster, build_forecaster
-from epo_lightning.metrics.forecast import SCORES
+from epo_lightning.metrics.forecast import scores
 from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.run_folder import RunFolder
 from epo_lightning.schema import check_part
@@ -127,7 +127,7 @@ def check_monitor(monitor: str, task: Task) -> None:
     Raises:
         ConfigError: an unknown name, with the nearest known one.
     """
-    known = [f"val/{name}" for name in SCORES] + [f"val/{subset}/{name}" for subset in task.subsets for name in SCORES]
+    known = [f"val/{prefix}{name}" for prefix in ("", *(f"{subset}/" for subset in task.subsets)) for name in scores()]
     if monitor not in known and not monitor.startswith("train/"):
         raise ConfigError(f"unknown callbacks.monitor {monitor!r}: {nearest(monitor, known)}")
 

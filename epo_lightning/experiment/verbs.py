@@ -170,8 +170,9 @@ def _print_trained(run: RunFolder) -> float | None:
 
 
 def _headline(metrics: Mapping[str, float]) -> str:
-    """The most important scores, in one line."""
-    return ", ".join(f"{name} {metrics[name]:.4f}" for name in HEADLINE if name in metrics)
+    """The most important scores, and those of registered metrics, in one line."""
+    own = [name for name in metrics if name.startswith("own/")]
+    return ", ".join(f"{name} {metrics[name]:.4f}" for name in (*HEADLINE, *own) if name in metrics)
 
 
 def evaluate_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None:

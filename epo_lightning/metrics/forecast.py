@@ -16,6 +16,7 @@ from epo_lightning.metrics.functional import expected_calibration_error, reliabi
 from epo_lightning.metrics.functional.calibration import BINS
 from epo_lightning.metrics.functional.displacement import Errors
 from epo_lightning.metrics.functional.overlap import overlap_rates
+from epo_lightning.registry import ConfigError, failing_place, parts, place
 from epo_lightning.scene import SHAPES, Scene, observed_future
 
 METRICS = ("minADE", "minFDE", "minSADE", "minSFDE", "overlap_jfp", "overlap_authors")
@@ -54,13 +55,24 @@ COLUMNS = (
     *CONSTRAINT_METRICS,
 )
 """Scores that are means over scenes."""
-SCORES = (*COLUMNS, "ECE")
-"""All scores; ``ECE`` is the calibration error of the probabilities of several modes
-(:mod:`~epo_lightning.metrics.functional.calibration`)."""
-_OF_SUBSETS = tuple(
-    name not in EQUILIBRIUM_METRICS and (name not in MODE_METRICS or name == MODE_METRICS[0]) for name in COLUMNS
-)
-_OF_ALL = tuple(name not in COLLAPSE_METRICS for name in COLUMNS)
+OWN = "own/"
+"""Beginning of the names of registered metrics (:func:`own_values`)."""
+
+
+def columns() -> tuple[str, ...]:
+    """Names of all scores that are means over scenes, with those of registered metrics."""
+    return (*COLUMNS, *(OWN + name for name in parts("metric")))
+
+
+def scores() -> tuple[str, ...]:
+    """Names of all scores; ``ECE`` is the calibration error of the probabilities of several modes
+    (:mod:`~epo_lightning.metrics.functional.calibration`)."""
+    return (*columns(), "ECE")
+
+
+def of_subsets(metric: str) -> bool:
+    """Whether the scenes of a subset have a score of their own."""
+    return metric not in EQUILIBRIUM_METRICS and metric not in MODE_METRICS[1:]
 
 
 class ForecastMetrics(Metric):
@@ -71,7 +83,8 @@ class ForecastMetrics(Metric):
     scenes of a data set loses digits that tables print.
 
     Forecasts with several modes have scores of their probabilities as well (``minSADE_1``, ``brier_minSADE``, ``ECE``), and
-    subsets the share of scenes without any mode near the future (``missed``).
+    subsets the share of scenes without any mode near the future (``missed``). Metrics that are registered
+    (:func:`own_values`) follow, as ``own/<name>``.
 
     If a forecast has a measured equilibrium, its energies and Nash gaps are averaged as well, over all scenes but not by
     subset. Values that are not finite (a game that overflows) are left out, because one of them would make the mean
@@ -111,8 +124,9 @@ class ForecastMetrics(Metric):
         super().__init__(**options)
         check_choice("shape", shape, SHAPES, of="agents")
         self.subsets, self.shape = tuple(subsets), shape
+        self.columns = columns()
         # The first row is for all scenes, the others for one subset each.
-        zeros = torch.zeros(1 + len(self.subsets), len(COLUMNS), dtype=torch.float64)
+        zeros = torch.zeros(1 + len(self.subsets), len(self.columns), dtype=torch.float64)
         self.add_state("total", zeros, dist_reduce_fx="sum")
         self.add_state("count", zeros.clone(), dist_reduce_fx="sum")
         bins = torch.zeros(len(zeros), BINS, 3, dtype=torch.float64)
@@ -125,17 +139,17 @@ class ForecastMetrics(Metric):
             ValueError: the scene has no future or no sizes, or another number of agents or steps than the forecast.
         """
         average = Errors.average(forecast.states, *observed_future(scene, "displacements need"))
-        found = forecast_values(forecast, scene, average, self.shape)
+        found = {**forecast_values(forecast, scene, average, self.shape), **own_values(forecast, scene)}
         none = torch.full_like(found["minADE"], torch.nan)
-        values = torch.stack([found.get(name, none).double() for name in COLUMNS], dim=1)
+        values = torch.stack([found.get(name, none).double() for name in self.columns], dim=1)
         groups = torch.ones(len(values), 1, dtype=torch.bool, device=values.device)
         if self.subsets:
             numbers = torch.arange(len(self.subsets), device=values.device)
             subset = torch.full_like(numbers[:1], -1).expand(len(values)) if scene.subset is None else scene.subset
             groups = torch.cat([groups, subset[:, None] == numbers], dim=1)
         counted = groups[:, :, None] & ~values.isnan()[:, None]  # scene, group, metric
-        counted[:, :1] &= torch.tensor(_OF_ALL, device=values.device)
-        counted[:, 1:] &= torch.tensor(_OF_SUBSETS, device=values.device)
+        counted[:, :1] &= torch.tensor([name not in COLLAPSE_METRICS for name in self.columns], device=values.device)
+        counted[:, 1:] &= torch.tensor([of_subsets(name) for name in self.columns], device=values.device)
         self.total += torch.where(counted, values[:, None], 0.0).sum(0)
         self.count += counted.sum(0)
         self.bins += torch.einsum("bg,bnx->gnx", groups.double(), calibration_values(forecast.probabilities, average))
@@ -150,7 +164,7 @@ class ForecastMetrics(Metric):
         mean, calibration = self.total / self.count, expected_calibration_error(self.bins)
         scores = dict(zip(METRICS, mean[0], strict=False))
         for row, prefix in enumerate(("", *(f"{name}/" for name in self.subsets))):
-            for column, metric in enumerate(COLUMNS):
+            for column, metric in enumerate(self.columns):
                 if self.count[row, column] > 0:
                     scores[prefix + metric] = mean[row, column]
             if self.bins[row].any():
@@ -195,6 +209,34 @@ def forecast_values(
         values["brier_minSADE"] = average.brier(probabilities)
     if (lost := stopped(forecast)) is not None:
         values[STOPPED] = lost.double().mean(1)
+    return values
+
+
+def own_values(forecast: JointForecast, scene: Scene) -> dict[str, Float[Tensor, " B"]]:
+    """Values of the registered metrics by name, ``own/<name>``.
+
+    A metric is a function of a forecast and its scene that returns a value for every scene, NaN for scenes without one::
+
+        @register("metric", "jerk")
+        def jerk(forecast: JointForecast, scene: Scene) -> Float[Tensor, " B"]: ...
+
+    Raises:
+        ConfigError: a metric that fails, or returns something else.
+    """
+    values = {}
+    for name, metric in parts("metric").items():
+        try:
+            value = metric(forecast, scene)
+        except Exception as error:
+            where = failing_place(error, metric)
+            raise ConfigError(f"the metric {name!r} fails at {where}, {type(error).__name__}: {error}") from error
+        shape = list(value.shape) if isinstance(value, Tensor) else type(value).__name__
+        if shape != [len(scene.history)]:
+            raise ConfigError(
+                f"{place(metric)}: the metric {name!r} returned {shape}; a tensor [{len(scene.history)}] was expected, a "
+                "number for every scene"
+            )
+        values[OWN + name] = value
     return values
 
 

@@ -25,8 +25,9 @@ class Column:
     @property
     def ranked(self) -> bool:
         """Whether rows are ranked by it; energies and their gradients and gaps have different units in each row, the
-        effect of pair terms is neither good nor bad, and of a correlation with the truth more is better."""
-        return self.metric not in OWN_UNITS and not self.is_effect and not self.metric.startswith(TRUE)
+        effect of pair terms is neither good nor bad, of a correlation with the truth more is better, and of a registered
+        metric it is not known."""
+        return not (self.metric in OWN_UNITS or self.is_effect or self.metric.startswith(TRUE) or OWN in self.metric)
 
     @property
     def is_effect(self) -> bool:
@@ -105,6 +106,9 @@ STOPPED = "stopped"
 
 TRUE = "true_"
 """Beginning of the names of metrics that compare inferred costs with the true ones."""
+
+OWN = "own/"
+"""Beginning of the names of metrics that users have registered."""
 
 TRUTH = (
     Column(f"{TRUE}pair_rank", "w: rank correlation"),

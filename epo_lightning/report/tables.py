@@ -17,6 +17,7 @@ from epo_lightning.report.columns import (
     MAIN,
     OF_ALTERNATIVES,
     OF_MODES,
+    OWN,
     PAIR_EFFECT,
     PROBABILITIES,
     STOPPED,
@@ -61,8 +62,8 @@ def build_tables(runs: Iterable[EvaluatedRun]) -> list[Table]:
 
     The further tables show scores by subset, of the k most likely modes, of probabilities and missed alternatives, of
     initial beside solved strategies, the effect of pair terms, the distance of forecasts from an equilibrium of their
-    game, and of inferred costs from the true ones. They contain the rows that have such scores. Runs on one data set that
-    were tested on different groups of recordings are in different tables.
+    game, of inferred costs from the true ones, and registered metrics. They contain the rows that have such scores. Runs
+    on one data set that were tested on different groups of recordings are in different tables.
 
     Raises:
         ConfigError: rows of one table that were trained under different conditions, or the same run twice.
@@ -101,6 +102,9 @@ def build_tables(runs: Iterable[EvaluatedRun]) -> list[Table]:
         lost = (Column(STOPPED, "all scenes"), *subset_columns(rows, (Column(STOPPED, ""),)))
         tables += _partly_shown(f"{where}: share of modes that violate hard constraints", lost, rows)
         tables += _partly_shown(f"{where}: inferred against true costs", TRUTH, rows)
+        own = sorted({metric for row in rows for metric in row.cells if metric.startswith(OWN)})
+        measured = tuple(Column(metric, metric.removeprefix(OWN)) for metric in own)
+        tables += _partly_shown(f"{where}: further metrics", (*measured, *subset_columns(rows, measured)), rows)
     return tables
 
 
@@ -127,7 +131,7 @@ def subset_columns(rows: Iterable[Row], columns: Sequence[Column]) -> tuple[Colu
     """The columns for every named subset of the data of which a row has scores, subset by subset."""
     names = {metric.split("/")[0] for row in rows for metric in row.cells if "/" in metric}
     # The executed mode comes first, although "alternative" precedes "executed" in the files.
-    subsets = sorted(names - {"initial"}, key=lambda name: (name != "executed", name))
+    subsets = sorted(names - {"initial", OWN.strip("/")}, key=lambda name: (name != "executed", name))
     return tuple(Column(f"{name}/{c.metric}", f"{name} {c.label}".strip()) for name in subsets for c in columns)
 
 

@@ -1,0 +1,39 @@
+"""A registered metric from the training to the report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from experiment.conftest import Epo
+from torch import Tensor
+
+from epo_lightning import registry
+from epo_lightning.forecast import JointForecast
+from epo_lightning.scene import Scene
+
+
+def top_speed(forecast: JointForecast, scene: Scene) -> Tensor:
+    """The largest speed in any mode."""
+    return forecast.states[..., 3].flatten(1).amax(1)
+
+
+def test_older_runs_get_the_metric_when_they_are_evaluated_again(
+    epo: Epo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("data=drawn", "budget=smoke", "callbacks.progress=none", "score=test", "seed=0")
+    assert epo("train", "experiment=rpi/const_vel", *words) == 0
+    monkeypatch.setattr(registry, "_PARTS", {**registry._PARTS, "metric": {"top speed": top_speed}})
+    assert epo("train", "experiment=rpi/v_lstm_sc", *words, "callbacks.monitor=val/own/top speed") == 0
+    assert epo("report", "runs=runs", "out=before") == 0
+    before = (tmp_path / "before" / "results.md").read_text().partition("further metrics")[2]
+    assert "| V-LSTM + SC |" in before
+    assert "| Constant velocity |" not in before
+    capsys.readouterr()
+    assert epo("evaluate", "runs=runs") == 0
+    assert capsys.readouterr().out.count(", own/top speed ") == 2
+    assert epo("report", "runs=runs", "out=after") == 0
+    after = (tmp_path / "after" / "results.md").read_text().partition("further metrics")[2]
+    assert "| top speed |" in after
+    assert "| Constant velocity |" in after
+    assert "own and" not in (tmp_path / "after" / "results.md").read_text(), "no subset of scenes has this name"
