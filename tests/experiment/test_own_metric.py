@@ -18,6 +18,11 @@ def top_speed(forecast: JointForecast, scene: Scene) -> Tensor:
     return forecast.states[..., 3].flatten(1).amax(1)
 
 
+def table_of(report: Path) -> str:
+    """The table of further metrics in a report."""
+    return (report / "results.md").read_text().partition("further metrics\n\n")[2].partition("\n\n")[0]
+
+
 def test_older_runs_get_the_metric_when_they_are_evaluated_again(
     epo: Epo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -26,14 +31,14 @@ def test_older_runs_get_the_metric_when_they_are_evaluated_again(
     monkeypatch.setattr(registry, "_PARTS", {**registry._PARTS, "metric": {"top speed": top_speed}})
     assert epo("train", "experiment=rpi/v_lstm_sc", *words, "callbacks.monitor=val/own/top speed") == 0
     assert epo("report", "runs=runs", "out=before") == 0
-    before = (tmp_path / "before" / "results.md").read_text().partition("further metrics")[2]
+    before = table_of(tmp_path / "before")
     assert "| V-LSTM + SC |" in before
     assert "| Constant velocity |" not in before
     capsys.readouterr()
     assert epo("evaluate", "runs=runs") == 0
     assert capsys.readouterr().out.count(", own/top speed ") == 2
     assert epo("report", "runs=runs", "out=after") == 0
-    after = (tmp_path / "after" / "results.md").read_text().partition("further metrics")[2]
+    after = table_of(tmp_path / "after")
     assert "| top speed |" in after
     assert "| Constant velocity |" in after
     assert "own and" not in (tmp_path / "after" / "results.md").read_text(), "no subset of scenes has this name"
