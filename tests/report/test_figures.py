@@ -10,6 +10,8 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from epo_lightning.forecast import GameParameters, JointForecast
@@ -47,6 +49,19 @@ def game(count: int = 20, scale: float = 1.0) -> GameParameters:
     own = {name: torch.randn(count, MODES, AGENTS, generator=random) * scale for name in ("goal", "vel", "acc")}
     pair = {"proximity": torch.randn(count, MODES, 1, generator=random)}
     return GameParameters(own, pair, torch.zeros(count, MODES, AGENTS, FUTURE, 2))
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+    """The figures of weights that are saved, as they were."""
+    figures: list[Figure] = []
+
+    def keep(figure: Figure, path: str | Path) -> Path:
+        figures.append(figure)
+        return save(figure, path)
+
+    monkeypatch.setattr(weights, "save", keep)
+    return figures
 
 
 def pixels(path: Path) -> np.ndarray:
@@ -100,33 +115,99 @@ def test_weights_of_one_and_several_forecasters_are_drawn(tmp_path: Path) -> Non
     assert not np.array_equal(pixels(zero), pixels(one))
 
 
-def test_weights_are_drawn_as_the_squares_that_enter_the_energy(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    figures = []
-    monkeypatch.setattr(weights, "save", lambda figure, path: figures.append(figure) or save(figure, path))
+def test_weights_are_drawn_as_the_squares_that_enter_the_energy(tmp_path: Path, drawn: list[Figure]) -> None:
     own = {"goal": torch.full((20, MODES, AGENTS), -3.0)}
     pair = {"proximity": torch.full((20, MODES, 1), 0.1)}
     equal = GameParameters(own, pair, torch.zeros(20, MODES, AGENTS, FUTURE, 2))
     learned_weights(dataclasses.replace(forecast(scenes(20)), parameters=equal), tmp_path / "equal.png")
     medians = [
-        [float(line.get_xdata()[0]) for line in axes.lines if line.get_marker() == "o"] for axes in figures[0].axes
+        [float(line.get_xdata()[0]) for line in axes.lines if line.get_marker() == "o"] for axes in drawn[0].axes
     ]
     assert medians == [pytest.approx([9.0] * AGENTS), pytest.approx([0.01])]
 
 
-@pytest.mark.parametrize("spread", [0.01, 0.1, 0.4, 3.0])
-def test_numbers_below_narrow_weights_do_not_overlap(
-    tmp_path: Path, spread: float, monkeypatch: pytest.MonkeyPatch
+def bars_and_dots(axes: Axes) -> dict[tuple[str, str], list[float]]:
+    """Ends of the thin bar, ends of the thick bar and the dot, by the name below which and the colour in which they are."""
+    names = [text.get_text() for text in axes.get_yticklabels()]
+    found: dict[tuple[str, str], list[float]] = {}
+    for line in sorted(axes.lines, key=lambda line: (len(line.get_xdata()) == 1, line.get_linewidth())):
+        (height,) = {float(value) for value in line.get_ydata()}
+        name = names[int(np.abs(axes.get_yticks() - height).argmin())]
+        color = line.get_markeredgecolor() if line.get_marker() == "o" else line.get_color()
+        found.setdefault((name, color), []).extend(float(value) for value in line.get_xdata())
+    return found
+
+
+def test_bars_and_dots_are_percentiles_over_scenes_and_modes_of_every_agent(
+    tmp_path: Path, drawn: list[Figure]
 ) -> None:
-    figures = []
-    monkeypatch.setattr(weights, "save", lambda figure, path: figures.append(figure) or save(figure, path))
+    """Weights of every forecaster, feature and agent have a size and spread of their own, and some are negative."""
+    random, count, agents = np.random.default_rng(0), 30, 3
+    own: dict[str, dict[str, np.ndarray]] = {}
+    pair: dict[str, np.ndarray] = {}
+    forecasts = {}
+    for place, name in enumerate(("EPO", "EPO 2")):
+        size = 10.0 ** random.uniform(-1.0, 1.0, (2, agents))
+        values = size[:, None, None] * random.normal(0.5 * place, 1.0, (2, count, MODES, agents))
+        values[0, :, 1] *= 3.0  # the second mode is not like the first
+        own[name] = {"goal": values[0], "vel": values[1]}
+        pair[name] = random.normal(2.0, 1.0, (count, MODES, 3)) * np.array([0.1, 1.0, 10.0])
+        game = GameParameters(
+            {feature: torch.from_numpy(weight).float() for feature, weight in own[name].items()},
+            {"proximity": torch.from_numpy(pair[name]).float()},
+            torch.zeros(count, MODES, agents, FUTURE, 2),
+        )
+        states = torch.zeros(count, MODES, agents, FUTURE, 4)
+        forecasts[name] = JointForecast(states, torch.full((count, MODES), 1 / MODES), parameters=game)
+    learned_weights(forecasts, tmp_path / "weights.png")
+
+    (figure,) = drawn
+    (legend,) = figure.legends
+    colors = {
+        text.get_text(): handle.get_color()
+        for text, handle in zip(legend.get_texts(), legend.legend_handles, strict=True)
+    }
+    assert list(colors) == ["robot", "pedestrian", "agent 3"]
+    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    assert titles == ["EPO: own weights", "pair weights", "EPO 2: own weights", "pair weights"]
+    for name, (left, right) in zip(own, (figure.axes[:2], figure.axes[2:]), strict=True):
+        expected = {
+            (feature, color): np.percentile(weight[..., i] ** 2, [5, 95, 25, 75, 50])
+            for feature, weight in own[name].items()
+            for i, color in enumerate(colors.values())
+        }
+        shown = bars_and_dots(left)
+        assert shown.keys() == expected.keys()
+        for key, values in expected.items():
+            np.testing.assert_allclose(shown[key], values, rtol=1e-5, err_msg=str(key))
+        ((key, values),) = bars_and_dots(right).items()
+        assert key[0] == "proximity"
+        np.testing.assert_allclose(values, np.percentile(pair[name] ** 2, [5, 95, 25, 75, 50]), rtol=1e-5)
+
+
+def test_weights_without_influence_stand_at_the_end_of_the_axis_and_missing_ones_do_not_count(
+    tmp_path: Path, drawn: list[Figure]
+) -> None:
+    goal = torch.stack(
+        [torch.zeros(5, MODES), torch.tensor([[1.0], [2.0], [torch.nan], [3.0], [4.0]]).expand(-1, 2)], -1
+    )
+    game = GameParameters({"goal": goal}, {}, torch.zeros(5, MODES, AGENTS, FUTURE, 2))
+    learned_weights(dataclasses.replace(forecast(scenes(5)), parameters=game), tmp_path / "zero.png")
+    zero, present = bars_and_dots(drawn[0].axes[0]).values()
+    assert zero == pytest.approx([weights.SMALLEST] * 5)
+    squares = [1.0, 1.0, 4.0, 4.0, 9.0, 9.0, 16.0, 16.0]
+    assert present == pytest.approx(np.percentile(squares, [5, 95, 25, 75, 50]).tolist())
+    assert drawn[0].axes[0].get_xlim()[0] < weights.SMALLEST
+
+
+@pytest.mark.parametrize("spread", [0.01, 0.1, 0.4, 3.0])
+def test_numbers_below_narrow_weights_do_not_overlap(tmp_path: Path, spread: float, drawn: list[Figure]) -> None:
     random = torch.Generator().manual_seed(0)
     pair = {"proximity": 20 * (1 + spread * torch.rand(50, MODES, 1, generator=random))}
     own = game(50).own_weights
     narrow = GameParameters(own, pair, torch.zeros(50, MODES, AGENTS, FUTURE, 2))
     learned_weights(dataclasses.replace(forecast(scenes(50)), parameters=narrow), tmp_path / "narrow.png")
-    for axes in figures[0].axes:
+    for axes in drawn[0].axes:
         labels = [*axes.get_xticklabels(), *axes.get_xticklabels(minor=True)]
         low, high = axes.get_window_extent().x0 - 1, axes.get_window_extent().x1 + 1
         boxes = [label.get_window_extent() for label in labels if label.get_text()]
