@@ -187,8 +187,14 @@ def test_the_report_covers_the_set(data, records):
     assert report["sizes"]["train"]["records"] == len(records["train"]["step"])
     assert report["solver"]["main_converged"] == 1.0
     assert report["nash"]["executed"]["gain_share"] == 0.0
+    gains = np.concatenate([rows["gain"][:, 0] for rows in records.values()])
+    assert report["nash"]["executed"]["gain"]["1"] == pytest.approx(gains.max())
+    keys = ("game", "placement", "executed", "step")
+    places = {place for rows in records.values() for place in zip(*(rows[key].tolist() for key in keys), strict=True)}
+    followed = [place for place in places if (*place[:-1], place[-1] + 1) in places]
+    assert report["nash"]["bellman"] == {"pairs": len(followed), "max": pytest.approx(0.0, abs=1e-6)}
     assert report["motion"]["disc_overlaps"] == 0
-    assert report["motion"]["euler_residual"] < 1e-6
+    assert 0 < report["motion"]["euler_residual"] < 1e-6, "single precision leaves a residual"
     assert 0.05 < report["baselines"]["constant_velocity"]["executed"]["ade"] < 0.3
     *lines, place = data.summary()
     assert lines[1].split()[:3] == [
