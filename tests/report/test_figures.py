@@ -127,10 +127,12 @@ def test_weights_are_drawn_as_the_squares_that_enter_the_energy(tmp_path: Path, 
 
 
 def bars_and_dots(axes: Axes) -> dict[tuple[str, str], list[float]]:
-    """Ends of the thin bar, ends of the thick bar and the dot, by the name below which and the colour in which they are."""
+    """Ends of the thin bar, ends of the thick bar and the dot, by the name beside them and the colour, from above."""
+    assert axes.yaxis_inverted()
     names = [text.get_text() for text in axes.get_yticklabels()]
     found: dict[tuple[str, str], list[float]] = {}
-    for line in sorted(axes.lines, key=lambda line: (len(line.get_xdata()) == 1, line.get_linewidth())):
+    places = [(len(line.get_xdata()) == 1, line.get_linewidth(), line.get_ydata()[0]) for line in axes.lines]
+    for _, line in sorted(zip(places, axes.lines, strict=True), key=lambda entry: entry[0]):
         (height,) = {float(value) for value in line.get_ydata()}
         name = names[int(np.abs(axes.get_yticks() - height).argmin())]
         color = line.get_markeredgecolor() if line.get_marker() == "o" else line.get_color()
@@ -177,7 +179,7 @@ def test_bars_and_dots_are_percentiles_over_scenes_and_modes_of_every_agent(
             for i, color in enumerate(colors.values())
         }
         shown = bars_and_dots(left)
-        assert shown.keys() == expected.keys()
+        assert list(shown) == list(expected), "agents have the order of the legend"
         for key, values in expected.items():
             np.testing.assert_allclose(shown[key], values, rtol=1e-5, err_msg=str(key))
         ((key, values),) = bars_and_dots(right).items()
