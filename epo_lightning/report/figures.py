@@ -171,5 +171,5 @@ def _explain(figure: Figure, scene: Scene, columns: int, modes: int, alternative
         handles.append(Line2D([], [], color=OTHER, lw=1.2, ls=(0, (4, 2)), label="other equilibrium"))
     if scene.goal_candidates is not None and scene.goal_candidates.shape[2] == 1:
         handles.append(Line2D([], [], marker="*", ms=11, mfc="white", mec=TRUTH, ls="", label="goal"))
-    handles += [Line2D([], [], color=MODES[m], lw=3, label=f"mode {m + 1}") for m in range(modes)]
+    handles += [Line2D([], [], color=MODES[m % len(MODES)], lw=3, label=f"mode {m + 1}") for m in range(modes)]
     figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 2 * columns), fontsize=8.5)

@@ -208,3 +208,19 @@ def test_all_positions_lie_within_the_limits_and_metres_are_equal(
         assert (points < high).all()
         right, up = axes.transData.transform([(1, 0), (0, 1)]) - axes.transData.transform((0, 0))
         assert right[0] == pytest.approx(up[1])
+
+
+def test_more_modes_than_colours_are_drawn(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The seventh mode has the colour of the first one, in its panel as in the legend."""
+    caught: list[Figure] = []
+    monkeypatch.setattr(figures, "save", lambda figure, path: caught.append(figure) or path)
+    many = JointForecast(walks(1, 7, AGENTS, steps=FUTURE, seed=5), torch.full((1, 7), 1 / 7))
+    joint_predictions(scene[0], {"EPO": many}, tmp_path / "many.png")
+    (legend,) = caught[0].legends
+    entries = zip(legend.get_texts(), legend.legend_handles, strict=True)
+    colors = {text.get_text(): handle.get_color() for text, handle in entries if isinstance(handle, Line2D)}
+    assert [colors[f"mode {mode + 1}"] for mode in range(7)] == [*MODES, MODES[0]]
+    drawn = [positions(path) for path in paths(caught[0].axes[0], MODES[0])]
+    ends = {tuple(path[-1].round(3)) for path in drawn}
+    expected = many.states[0, [0, 6], :, -1, :2].reshape(-1, 2).numpy()
+    assert ends == {tuple(end.round(3)) for end in expected.astype(float)}
