@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -34,7 +35,7 @@ class Imitation(Objective):
             :func:`~epo_lightning.losses.distances`.
     """
 
-    term_names = ("imitation", "goal", "probability", "initial")
+    term_names: ClassVar[tuple[str, ...]] = ("imitation", "goal", "probability", "initial")
     through_solution = True
     observed_orders = True
 
