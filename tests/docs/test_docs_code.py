@@ -13,7 +13,7 @@ ELSEWHERE = {
     ("reports.md", "Report.of_folder"): "needs runs: test_docs_readme.py",
     ("tutorial.md", ""): "test_docs_tutorial.py",
     ("formats.md", "waymo"): "tests/data/recorded/formats/test_waymo.py",
-    ("extend.md", ""): "test_documented_backbone.py, tests/game/test_extend.py",
+    ("extend.md", ""): "test_documented_backbone.py, test_docs_extend.py, test_extend.py of tests/game and tests/data",
 }
 """Blocks that other tests run, by page and a word in them."""
 CHEAPER = {

@@ -29,6 +29,8 @@ OF_EXAMPLES = {
     "gru": "of extend.md, whose code tests/backbones/test_documented_backbone.py runs",
     "curvature": "of extend.md, whose code tests/game/test_extend.py runs",
     "rpi_curvature": "of extend.md",
+    "imitation_speed": "of extend.md, whose code test_docs_extend.py runs",
+    "fixed_step": "of extend.md, whose code test_docs_extend.py runs",
     "my_conf": "of extend.md",
 }
 MAKEFILE = (ROOT / "Makefile").read_text()

@@ -23,6 +23,9 @@ EXAMPLES = {
     "test_curvature",
     "rpi_curvature",
     "v_lstm_epo_curvature",
+    "imitation_speed",
+    "test_imitation_speed",
+    "fixed_step",
 }
 """Files that the pages tell a reader to write."""
 
