@@ -22,6 +22,7 @@ from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.metrics import METRICS
 from epo_lightning.objectives.imitation import Imitation
 from epo_lightning.registry import ConfigError, parts
+from epo_lightning.report import columns
 from epo_lightning.schema import read
 from epo_lightning.solvers.base import Minimiser
 
@@ -169,6 +170,6 @@ def test_the_documented_lines_add_the_metric(defined: dict[str, Any]) -> None:
     assert tuple(scores)[: len(METRICS)] == METRICS
     for name, chosen in (("", subset >= 0), ("even/", subset == 0), ("odd/", subset == 1)):
         torch.testing.assert_close(scores[f"{name}heading_error"], expected[chosen].nanmean(), rtol=1e-6, atol=1e-6)
-    names = {"__name__": "epo_lightning.report.columns"}
+    names = {"__name__": columns.__name__}
     exec(compile(of_columns, "edited", "exec", dont_inherit=True), names)
     assert names["MAIN"][-1].metric == "heading_error"
