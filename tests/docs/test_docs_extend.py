@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import re
 from collections.abc import Iterator
@@ -19,15 +20,14 @@ from epo_lightning import registry
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config import compose
 from epo_lightning.experiment.config.settings import Settings
-from epo_lightning.metrics import METRICS
+from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.objectives.imitation import Imitation
 from epo_lightning.registry import ConfigError, parts
-from epo_lightning.report import columns
 from epo_lightning.schema import read
 from epo_lightning.solvers.base import Minimiser
 
 PAGE = ROOT / "docs" / "extend.md"
-ADDED = ("objective", "imitation_speed"), ("solver", "fixed_step")
+ADDED = ("objective", "imitation_speed"), ("solver", "fixed_step"), ("metric", "heading_error")
 
 
 def section(title: str) -> str:
@@ -132,44 +132,19 @@ def slow_heading_error(case: Case) -> list[float]:
 @pytest.mark.parametrize("seed", range(5))
 def test_the_documented_metric_equals_a_slow_reference(defined: dict[str, Any], seed: int) -> None:
     case = make_case(seed, scenes=20, agents=2, steps=2)
-    found = defined["heading_error"](case.states, case.probabilities, case.future, case.mask)
+    found = defined["heading_error"](case.forecast(), case.scene(None))
     expected = torch.tensor(slow_heading_error(case), dtype=torch.float64)
-    torch.testing.assert_close(found, expected, equal_nan=True)
-    broken = defined["heading_error"](case.states * math.nan, case.probabilities, case.future, case.mask)
-    assert torch.equal(broken.isposinf(), expected.isfinite())
+    torch.testing.assert_close(found.double(), expected, rtol=1e-6, atol=1e-6, equal_nan=True)
+    broken = dataclasses.replace(case.forecast(), states=case.forecast().states * math.nan)
+    assert torch.equal(defined["heading_error"](broken, case.scene(None)).isposinf(), expected.isfinite())
 
 
-def edited(file: str, hunks: list[str]) -> str:
-    """The source of a file after the changes of a diff on the page."""
-    text = (ROOT / file).read_text()
-    for hunk in hunks:
-        lines = hunk.splitlines()
-        before = "".join(f"{line[1:]}\n" for line in lines if line.startswith(" "))
-        assert text.count(before) == 1, before
-        text = text.replace(before, "".join(f"{line[1:]}\n" for line in lines))
-    return text
-
-
-def test_the_documented_lines_add_the_metric(defined: dict[str, Any]) -> None:
-    (diff,) = documented("A metric", "diff")
-    sources = {}
-    for part in diff.split("--- ")[1:]:
-        file, _, hunks = part.partition("\n")
-        sources[file] = edited(file, hunks.split("...\n"))
-    of_metrics, of_columns = sources.values()
-    line = "from epo_lightning.metrics.functional.heading import heading_error\n"
-    assert of_metrics.count(line) == 1
-    names: dict[str, Any] = {"__name__": "edited", "heading_error": defined["heading_error"]}
-    exec(compile(of_metrics.replace(line, ""), "edited", "exec", dont_inherit=True), names)
-    case = make_case(3, scenes=8)
-    subset = torch.arange(8) % 2
-    metrics = names["ForecastMetrics"](subsets=("even", "odd"))
-    for half in (slice(0, 5), slice(5, 8)):
-        metrics.update(case.forecast()[half], case.scene(subset)[half])
+def test_the_documented_metric_is_computed_with_the_others(defined: dict[str, Any]) -> None:
+    case, subset = make_case(3, scenes=8), torch.arange(8) % 2
+    metrics = ForecastMetrics(("executed", "alternative"))
+    metrics.update(case.forecast(), case.scene(subset))
     scores, expected = metrics.compute(), torch.tensor(slow_heading_error(case)).double()
-    assert tuple(scores)[: len(METRICS)] == METRICS
-    for name, chosen in (("", subset >= 0), ("even/", subset == 0), ("odd/", subset == 1)):
-        torch.testing.assert_close(scores[f"{name}heading_error"], expected[chosen].nanmean(), rtol=1e-6, atol=1e-6)
-    names = {"__name__": columns.__name__}
-    exec(compile(of_columns, "edited", "exec", dont_inherit=True), names)
-    assert names["MAIN"][-1].metric == "heading_error"
+    for name, chosen in (("", subset >= 0), ("executed/", subset == 0)):
+        shown = f"{name}own/heading_error"
+        assert f"`{shown}`" in section("A metric")
+        torch.testing.assert_close(scores[shown], expected[chosen].nanmean(), rtol=1e-6, atol=1e-6)
