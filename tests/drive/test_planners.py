@@ -18,7 +18,7 @@ from epo_lightning.drive.planners import (
     shifted,
 )
 from epo_lightning.drive.rpi import RPIWorld
-from epo_lightning.forecast import JointForecast
+from epo_lightning.forecast import JointForecast, Status
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.frames import in_world
 from epo_lightning.registry import ConfigError
@@ -93,6 +93,32 @@ def test_pair_terms_and_warm_starts_change_the_solved_game(world: RPIWorld, epo:
     warm = ForecastPlanner(epo, warm=True)
     torch.testing.assert_close(warm(scene, previous).states, epo.solve(scene, onward).states[rows, mode])
     torch.testing.assert_close(warm(scene, None).states, likely(forecast))
+
+
+def test_a_plan_is_found_where_its_own_mode_is_finite_and_its_solver_did_not_stop(
+    world: RPIWorld, epo: Forecaster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What happens in modes that are not chosen does not matter."""
+    scene = world.observe()
+    forecast = epo.predict(scene)
+    solution = forecast.solution
+    assert solution is not None
+    chosen = forecast.probabilities.argmax(1).tolist()
+    states, solved, status = forecast.states.clone(), solution.states.clone(), solution.status.clone()
+    status[:] = Status.COMPLETED
+    for values in (states, solved):
+        values[0, chosen[0], 1, 3, 0] = torch.nan  # the other agent's future belongs to the plan
+        values[2, 1 - chosen[2]] = torch.nan
+    known = ForecastPlanner(Given(epo, dataclasses.replace(forecast, states=states)))(scene, None)
+    assert known.found.tolist() == [False, True, True]
+    status[1, chosen[1]], status[2, 1 - chosen[2]] = Status.STOPPED, Status.STOPPED
+    solution = dataclasses.replace(solution, states=solved, status=status)
+    forecast = dataclasses.replace(forecast, solution=solution)
+    monkeypatch.setattr(type(epo), "forward", lambda _self, _scene: forecast)
+    plan = ForecastPlanner(epo)(scene, None)
+    assert plan.found.tolist() == [False, False, True]
+    resting = plan.or_else(known, scene)
+    torch.testing.assert_close(resting.controls[1], shifted(known.controls, known.controls.shape[1])[1])
 
 
 def test_options_of_a_game_need_a_game() -> None:
