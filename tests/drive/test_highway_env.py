@@ -82,13 +82,28 @@ def test_scenes_on_several_maps_have_the_order_of_their_episodes() -> None:
     torch.testing.assert_close(mixed.observe().history, torch.stack((first, middle, last)))
 
 
-def test_left_is_left(world: TrafficWorld) -> None:
-    world.reset([0])
-    lanes = world.rides[0].simulation.lanes
-    for lane in np.flatnonzero(lanes.left_of >= 0):
-        position = lanes.centre[lanes.left_of[lane]][1][None]
-        _, offset = lanes.centrelines.project(np.array([lane]), position)
-        assert 3.0 < float(offset[0]) < 5.0
+@pytest.mark.parametrize(("place", "left", "right"), [("merge", 4, 3), ("roundabout", 8, 8)])
+def test_left_is_left_and_right_is_right(place: str, left: int, right: int) -> None:
+    """Lanes are 4 m wide. The number of them with one on the left differs from that of those with an open one on the right
+    by the lane of the ramp, which may be left but not entered."""
+    lanes = HighwayEnvSimulator(1, 1, place).roads.lanes
+    for beside, count, side in ((lanes.left_of, left, 1), (lanes.right_of, right, -1)):
+        having = np.flatnonzero(beside >= 0)
+        assert len(having) == count
+        for lane in having:
+            position = lanes.centre[beside[lane]][1][None]
+            _, offset = lanes.centrelines.project(np.array([lane]), position)
+            assert 3.0 < side * float(offset[0]) < 5.0
+
+
+def test_no_vehicle_changes_to_the_forbidden_lane_of_the_ramp() -> None:
+    simulator = HighwayEnvSimulator(1, 1, "merge")
+    keys, lanes = highway_env.keys_of(simulator._environment.road.network), simulator.roads.lanes
+    fast, slow, ramp = (keys.index(("b", "c", number)) for number in range(3))
+    assert lanes.left_of[[fast, slow, ramp]].tolist() == [-1, fast, slow]
+    assert lanes.right_of[[fast, slow, ramp]].tolist() == [slow, -1, -1]
+    assert lanes.adjacent_left[[fast, slow, ramp]].tolist() == [-1, fast, slow]
+    assert lanes.adjacent_right[[fast, slow, ramp]].tolist() == [slow, ramp, -1], "it is there all the same"
 
 
 def test_episodes_repeat_and_differ(world: TrafficWorld) -> None:
