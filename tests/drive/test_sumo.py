@@ -17,7 +17,7 @@ from epo_lightning.data.simulate.layout import LAYOUTS, Layout
 from epo_lightning.drive.episodes import play
 from epo_lightning.drive.measures import measure
 from epo_lightning.drive.planners import ForecastPlanner, Plan, Planner, ResponsePlanner
-from epo_lightning.drive.ride import SEEN
+from epo_lightning.drive.ride import SEEN, Moment
 from epo_lightning.drive.traffic import TrafficWorld
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import Scene
@@ -82,22 +82,113 @@ def test_episodes_differ_and_begin_on_the_ramp(world: TrafficWorld) -> None:
     assert not any(torch.equal(a, b) for a, b in pairwise(begun))
 
 
+def following_the_ramp(world: TrafficWorld, acceleration: float) -> list[Moment]:
+    """All moments of five seconds in which the planned vehicle stays in the middle of its lane, whatever it touches."""
+    world.reset([1])
+    (ride,) = world.rides
+    simulation = ride.simulation
+    assert isinstance(simulation, SumoSimulation)
+    layout, ramp, moments = simulation.layout, simulation.ramp, [ride.now]
+    state = ride.now.states[0]
+    (s, _), speed = layout.project(state[:2]), state[3]
+    for _ in range(25):
+        s, speed = s + 0.2 * speed, speed + 0.2 * acceleration
+        before, state = state, np.array([*layout.locate(s, layout.offset(ramp, s)), layout.direction(ramp, s), speed])
+        simulation.step((before, state))
+        moments.append(simulation.moment())
+        np.testing.assert_array_equal(moments[-1].states[0], state)
+    return moments
+
+
 def test_drivers_behind_react_to_the_planned_vehicle(world: TrafficWorld) -> None:
-    """A vehicle that stops in front of others makes them brake."""
+    """The nearest driver on the same lane, 50 m behind, brakes for a vehicle that does, and speeds up behind another one."""
+    braked, kept = following_the_ramp(world, -4.0), following_the_ramp(world, 0.0)
+    begin = braked[0]
+    assert begin.names == kept[0].names
+    assert np.array_equal(begin.states, kept[0].states)
+    s, d = LAYOUTS[1].project(begin.states[:, :2])
+    ramp = LAYOUTS[1].lanes[3]
+    on_ramp = np.abs(d - LAYOUTS[1].offset(ramp, s)) < 1.0
+    gaps = {name: float(s[0] - s[row]) for name, row in begin.rows.items() if on_ramp[row] and s[row] < s[0]}
+    gap, follower = min((gap, name) for name, gap in gaps.items())
+    assert 30.0 < gap < 60.0
+    first, slow, fast = (moment.states[moment.rows[follower], 3] for moment in (begin, braked[-1], kept[-1]))
+    assert slow < first - 3.0
+    assert fast > first + 1.0
+    assert fast - slow > 5.0
 
-    def slowest_behind(control: float) -> float:
-        outcome = play(world, keeps(control), [0]).outcome
-        end = outcome.states[0, :, -1]
-        ahead = outcome.states[0, 0, 0, 2]
-        along = (end[:, 0] - end[0, 0]) * ahead.cos() + (end[:, 1] - end[0, 1]) * ahead.sin()
-        behind = outcome.agent_mask[0, :, -1] & (along < -1.0)
-        return float(end[behind, 3].sum())
 
-    world.simulator.steps = 25
-    try:
-        assert slowest_behind(-4.0) != slowest_behind(0.0)
-    finally:
-        world.simulator.steps = 12
+def test_sumo_moves_the_planned_vehicle_to_where_it_is_put(world: TrafficWorld) -> None:
+    """Down the ramp, and then to the lane beside it: what others see is the vehicle in SUMO, at the place that was meant."""
+    world.reset([1])
+    (ride,) = world.rides
+    simulation, state = ride.simulation, ride.now.states[0]
+    assert isinstance(simulation, SumoSimulation)
+    layout, ramp = simulation.layout, simulation.ramp
+    s, _ = layout.project(state[:2])
+    strips = []
+    for _ in range(25):
+        s += 5.0
+        d = layout.offset(ramp, s) + layout.width * np.clip((s - ramp.join) / 50.0, 0.0, 1.0)
+        before, state = state, np.array([*layout.locate(s, d), state[2], 25.0])
+        simulation.step((before, state))
+        vehicles = simulation._answer()
+        row = vehicles.names.index(simulation._name)
+        front, aside, speed, _, length, *_ = vehicles.values[row]
+        lane = layout.lanes[vehicles.strip[row]]
+        assert front - length / 2 == pytest.approx(float(s), abs=0.01)
+        assert layout.offset(lane, s) + aside == pytest.approx(float(d), abs=0.01)
+        strips.append(vehicles.strip[row])
+    assert (strips[0], strips[-1]) == (3, 0), "from the ramp to the right one of the road's three lanes"
+    assert speed == pytest.approx(25.0, abs=0.1)
+
+
+def test_a_vehicle_on_the_ramp_has_to_leave_it_and_arrives_behind_its_end(world: TrafficWorld) -> None:
+    """The acceleration lane touches the road at 640 m and ends at 960 m; lanes are 3.75 m wide, and the right one of three
+    on the road has its middle at 0 m. At 600 m the ramp is still 0.6 m farther to the right."""
+    world.reset([1])
+    (ride,) = world.rides
+    simulation = ride.simulation
+    assert isinstance(simulation, SumoSimulation)
+    begin, _ = simulation.layout.project(ride.now.states[0, :2])
+    places = [  # s, d, arrived, off_road, line
+        (600.0, -4.35, False, False, 1),
+        (639.0, -3.75, False, False, 1),
+        (641.0, -3.75, False, False, 0),
+        (950.0, -3.75, False, False, 0),
+        (700.0, -2.0, False, False, 0),
+        (700.0, -1.75, False, False, 1),
+        (641.0, 0.0, False, False, 1),
+        (700.0, 7.5, False, False, 1),
+        (700.0, -3.75 - 1.875 - 0.29, False, False, 0),
+        (700.0, -3.75 - 1.875 - 0.31, False, True, 0),
+        (700.0, 7.5 + 1.875 + 0.29, False, False, 1),
+        (700.0, 7.5 + 1.875 + 0.31, False, True, 1),
+        (600.0, -4.35 - 1.875 - 0.4, False, True, 1),
+        (965.0, -3.75, False, True, 1),
+        (965.0, -1.875 - 0.29, False, False, 1),
+        (1009.9, 0.0, False, False, 1),
+        (1010.1, 0.0, True, False, 1),
+        (1010.1, 7.5, True, False, 1),
+    ]
+    for s, d, arrived, off_road, line in places:
+        x, y = simulation.layout.locate(np.array(s), np.array(d))
+        found = simulation.position(np.array([x, y, 0.0, 20.0]))
+        assert found.progress == pytest.approx(s - float(begin), abs=0.01)
+        assert (found.arrived, found.off_road, found.line) == (arrived, off_road, line), (s, d)
+
+
+def test_a_vehicle_that_takes_the_next_exit_does_not_arrive(world: TrafficWorld) -> None:
+    """On the weaving section, the lane of the ramp becomes an exit at 1080 m. Lanes are 3.5 m wide, and at
+    1135 m the exit has turned away by 1.2 m."""
+    world.reset([3])
+    simulation = world.rides[0].simulation
+    assert isinstance(simulation, SumoSimulation)
+    assert simulation.layout.name == "weave"
+    for s, d, arrived in ((1129.9, 0.0, False), (1130.1, 0.0, True), (1130.1, 3.5, True), (1135.0, -4.7, False)):
+        x, y = simulation.layout.locate(np.array(s), np.array(d))
+        found = simulation.position(np.array([x, y, 0.0, 20.0]))
+        assert (found.arrived, found.off_road) == (arrived, False), (s, d)
 
 
 def test_a_forecaster_and_a_response_drive(world: TrafficWorld) -> None:
