@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from multiprocessing import Pipe
 from types import SimpleNamespace
 from typing import cast
@@ -73,6 +74,8 @@ def test_an_episode_of_dense_traffic_is_driven(monkeypatch: pytest.MonkeyPatch) 
         slow_down(name, speed, seconds)
 
     monkeypatch.setattr(vehicle, "slowDown", slowed)
+    often = {"dense": replace(STYLES["dense"], every=3.0)}  # most of them in the 4 s of the episode
+    monkeypatch.setattr("epo_lightning.drive.sumo_process.STYLES", often)
     begin = road.time
     for message in (*[OWN] * STEPS, END):
         here.send(message)
@@ -81,7 +84,10 @@ def test_an_episode_of_dense_traffic_is_driven(monkeypatch: pytest.MonkeyPatch) 
     streaming.close()
     assert ended.value.code == 0
     taken, _ = here.recv()
-    moments = [here.recv() for _ in range(STEPS)]
+    moments = []
+    while here.poll():
+        moments.append(here.recv())
+    assert len(moments) == STEPS
     assert all(isinstance(moment, Vehicles) and taken in moment.names for moment in moments)
     assert taken not in {name for name, *_ in found}, "the planned vehicle is not told to brake"
     braked = 0
@@ -91,4 +97,4 @@ def test_an_episode_of_dense_traffic_is_driven(monkeypatch: pytest.MonkeyPatch) 
         if step < STEPS and name in moments[step].names:
             assert moments[step].values[moments[step].names.index(name), 2] < speed
             braked += 1
-    assert braked > 1
+    assert braked > 3
