@@ -243,7 +243,7 @@ class SumoSimulation:
         on_ramp = lane is self.ramp
         return Position(
             progress=s - self._from,
-            arrived=s >= self._end_of_ramp + BEYOND and not on_ramp,
+            arrived=s >= self._end_of_ramp + BEYOND and not on_ramp and beside <= ASIDE,
             off_road=beside > ASIDE,
             line=0 if on_ramp and self.ramp.join <= s else 1,
         )
