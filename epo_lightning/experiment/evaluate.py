@@ -52,7 +52,7 @@ def evaluate(config: dict[str, Any], overrides: Sequence[str] = ()) -> list[tupl
 
     Raises:
         ConfigError: no run, a run that is not finished, changed data, or a checkpoint that does not fit. Among several
-            runs, those that cannot read the other data are left out, unless that is all of them.
+            runs, those that cannot be scored are left out with a line each, unless that is all of them.
     """
     assembly.quiet()
     settings, given = read(EvaluateSettings, config), keys_of(overrides)
@@ -61,12 +61,13 @@ def evaluate(config: dict[str, Any], overrides: Sequence[str] = ()) -> list[tupl
         try:
             scored.append((run, *score(run, settings, given=given)))
         except ConfigError as error:
-            if settings.run is not None or settings.data is None:
+            if settings.run is not None:
                 raise
             refused.append(error)
             print(f"{run.path}: left out, {error}")
     if refused and not scored:
-        raise ConfigError(f"none of the {len(refused)} runs can be scored on this data: {refused[0]}")
+        where = "" if settings.data is None else " on this data"
+        raise ConfigError(f"none of the {len(refused)} runs can be scored{where}: {refused[0]}")
     return scored
 
 

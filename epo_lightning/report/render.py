@@ -224,19 +224,21 @@ def settings_sheet(best: Sequence[BestSetting]) -> Sheet:
 
 def to_rich(table: Table | Sheet) -> RichTable:
     """Table for a terminal of 80 columns: deviations below their means, the paper's values below each row."""
-    rich = RichTable(title=table.title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    rich = RichTable(
+        title=Text(table.title), title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=(0, 1, 0, 0)
+    )
     if isinstance(table, Sheet):
         rich.caption, rich.caption_justify = Text(table.note, style="dim") if table.note else None, "left"
         for place, name in enumerate(table.header):
             is_text = place < table.left
-            rich.add_column(name, justify="left" if is_text else "right", no_wrap=False, overflow="fold")
+            rich.add_column(Text(name), justify="left" if is_text else "right", no_wrap=False, overflow="fold")
         for index, line in enumerate(table.lines):
             rich.add_row(*map(Text, line), end_section=index in table.ends)
         return rich
     rich.add_column("method")  # the one column that may break its lines: half a number is worse than none
     rich.add_column("n", justify="right", no_wrap=True)
     for column in table.columns:
-        rich.add_column(column.label.replace(" ", "\n"), justify="right", no_wrap=True, vertical="top")
+        rich.add_column(Text(column.label.replace(" ", "\n")), justify="right", no_wrap=True, vertical="top")
     for row, last in with_ends(table.rows):
         paper = [paper_text(row, column) for column in table.columns]
         cells = (_rich_cell(row, column) for column in table.columns)

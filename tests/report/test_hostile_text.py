@@ -68,3 +68,11 @@ def test_powers_of_ten_are_written_without_mathematics(tmp_path: Path) -> None:
     figure = Figure()
     figure.text(0, 0, "10⁻¹² w²")
     save(figure, tmp_path / "glyphs.png")  # a missing glyph is a warning, and so an error
+
+
+def test_brackets_in_names_are_no_markup_of_the_terminal(tmp_path: Path) -> None:
+    make_run(tmp_path / "runs", "[bold]x", "epo", {**scores(0.0), "own/jerk [/m/s3]": 1.0})
+    terminal = io.StringIO()
+    write_report(Report.of_folder(tmp_path / "runs"), tmp_path / "out", console=Console(file=terminal))
+    assert "[/m/s3]" in terminal.getvalue()
+    assert "[bold]x" in terminal.getvalue()
