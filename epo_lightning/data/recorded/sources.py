@@ -13,7 +13,7 @@ import json
 import time
 import warnings
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
@@ -21,7 +21,7 @@ from typing import Any
 
 from epo_lightning.data import cache
 from epo_lightning.data.recorded.tracks import Recording, RecordingSource
-from epo_lightning.registry import ConfigError, lookup, nearest
+from epo_lightning.registry import ConfigError, lookup, nearest, place
 
 PIECE, PIECES = 1 << 14, 64
 """Size [bytes] and number of the pieces of a file that enter its checksum; files up to 1 MB are covered completely."""
@@ -94,7 +94,8 @@ def listed(
         dataset, format, root: name of the data set, name of its format and folder of the cache, for messages.
 
     Raises:
-        ConfigError: the folder is missing or holds no recording, or the name of a file is not UTF-8.
+        ConfigError: the folder is missing or holds no recording, the function returns something else, or the name of a file
+            is not UTF-8.
     """
     if folder.is_file():
         raise ConfigError(f"{folder} is a file: data.folder takes the folder that it lies in")
@@ -103,11 +104,30 @@ def listed(
             f"no folder {folder} with {dataset} recordings, and no data set that was extracted from such "
             f"recordings in {root}: point data.folder at the recordings, or unpack them there"
         )
-    found = sorted(list_sources(folder), key=lambda source: source.name)
+    found = sorted(_checked(list_sources(folder), format), key=lambda source: source.name)
     if not found:
         raise ConfigError(f"{folder} holds no recording in the format {format!r}: is it the right folder?")
     _check_names(found)
     return found
+
+
+def _checked(returned: Any, format: str) -> list[RecordingSource]:
+    """What the function of a format returned, if it is recordings.
+
+    Raises:
+        ConfigError: it is something else; the message names the function's file.
+    """
+    what = "None" if returned is None else type(returned).__name__
+    if isinstance(returned, Iterable):
+        found = list(returned)
+        others = {type(entry).__name__ for entry in found if not isinstance(entry, RecordingSource)}
+        if not others:
+            return found
+        what += f" of {', '.join(sorted(others))}"
+    raise ConfigError(
+        f"{place(lookup('format', format))}: format {format!r} returned {what}; a list of RecordingSource was expected"
+        + (": is a return missing?" if returned is None else "")
+    )
 
 
 def absent() -> Recording:

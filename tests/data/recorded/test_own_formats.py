@@ -1,0 +1,65 @@
+"""Mistakes in a format of one's own are refused in one message that names the file, and says what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from epo_lightning.data.recorded.recordings import RecordedData
+from epo_lightning.data.recorded.tracks import RecordingSource
+from epo_lightning.registry import ConfigError, register
+
+from .roads import recording
+
+
+def source(file: Path) -> RecordingSource:
+    """A recording of a road, whatever the file holds."""
+    return RecordingSource(file.stem, file.stem, (file,), recording)
+
+
+RETURNED: dict[str, Callable[[list[Path]], Any]] = {
+    "sources": lambda files: [source(file) for file in files],
+    "generator": lambda files: (source(file) for file in files),
+    "nothing": lambda files: None,
+    "one": lambda files: source(files[0]),
+    "files": lambda files: files,
+    "text": lambda files: "a.feet",
+}
+"""What the function of the format returns, by the value of its option."""
+
+
+@register("format", "feet")
+def feet(folder: Path, returned: str = "sources", rate: float = 10.0) -> Any:
+    """Files ``<name>.feet``, listed as the option says."""
+    return RETURNED[returned](list(folder.glob("*.feet")))
+
+
+def data(folder: Path, **options: Any) -> RecordedData:
+    """The data of a folder with four recordings."""
+    for name in "abcd":
+        (folder / f"{name}.feet").touch()
+    return RecordedData("feet", "feet", str(folder), {"dt": 0.2}, root=str(folder / "cache"), options=options)
+
+
+@pytest.mark.parametrize("returned", ["sources", "generator"])
+def test_recordings_may_be_listed_in_any_order_of_any_iterable(tmp_path: Path, returned: str) -> None:
+    assert [source.name for source in data(tmp_path, returned=returned).sources()] == list("abcd")
+
+
+@pytest.mark.parametrize(
+    ("returned", "said"),
+    [
+        ("nothing", r"returned None; a list of RecordingSource was expected: is a return missing\?$"),
+        ("one", "returned RecordingSource; a list of RecordingSource was expected$"),
+        ("files", "returned list of PosixPath; a list of RecordingSource was expected$"),
+        ("text", "returned str of str; a list of RecordingSource was expected$"),
+    ],
+)
+def test_functions_that_return_something_else_are_named_with_their_file(
+    tmp_path: Path, returned: str, said: str
+) -> None:
+    with pytest.raises(ConfigError, match=rf"^{__file__}:\d+: format 'feet' {said}"):
+        data(tmp_path, returned=returned).sources()
