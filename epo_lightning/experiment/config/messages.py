@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import re
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +15,6 @@ from epo_lightning.registry import ConfigError, nearest, parts
 
 if TYPE_CHECKING:
     from hydra._internal.hydra import Hydra
-    from omegaconf import DictConfig
 
 PLUGINS = {
     "hydra/launcher/joblib": "local",
@@ -190,7 +189,7 @@ def _unknown_key(instance: Hydra, name: str, key: str, overrides: Sequence[str])
             break
         except Exception:  # other overrides are wrong as well: try again without any, which is enough to list the keys
             continue
-    walked: list[str] = []
+    whole, walked = config, list[str]()
     for word in key.replace("/", ".").split("."):
         names = [str(known) for known in config] if isinstance(config, DictConfig) else []
         if not walked and word != "hydra":
@@ -205,7 +204,10 @@ def _unknown_key(instance: Hydra, name: str, key: str, overrides: Sequence[str])
             if word not in defaults.overrides.known_choices:
                 return f"unknown key {key!r} of epo {name}: {word} is a choice of epo train, and a run keeps it"
             return f"{key} needs a choice of {word}: add {word}=<one of {', '.join(options)}>"
-        if word not in names and names and word in _settings_in(walked, config):
+        below, known = key.split(".")[len(walked) + 1 :], _settings_in([*walked, word], whole)
+        if word not in names and below and known and below[0] not in known:
+            return f"unknown key {key!r}: {nearest(below[0], known)}"
+        if word not in names and names and word in _settings_in(walked, whole):
             return f"{key} is a setting that the chosen file of {walked[0]} leaves at its default: set it by +{key}=<value>"
         if word not in names and walked:
             place = ".".join(walked)
@@ -224,15 +226,21 @@ def _unknown_key(instance: Hydra, name: str, key: str, overrides: Sequence[str])
     return f"unknown key {key!r}"
 
 
-def _settings_in(place: Sequence[str], section: DictConfig) -> Collection[str]:
+def _settings_in(place: Sequence[str], config: Any) -> Collection[str]:
     """Names of the settings of a place in the configuration, of which its file need not list all; empty for other places.
 
-    They are the arguments of the part that the section chooses, and the fields of ``data.windows``.
+    They are the arguments of the part that a section chooses, the fields of ``data.windows``, and the options of a format.
     """
     if list(place) == ["data", "windows"]:
         from epo_lightning.data.recorded.windows import WindowConfig
 
         return [field.name for field in dataclasses.fields(WindowConfig)]
+    section = config.get(place[0]) if isinstance(config, Mapping) and place else None
+    if not isinstance(section, Mapping):
+        return ()
+    if list(place) == ["data", "options"]:
+        listing = parts("format").get(str(section.get("format")))
+        return list(inspect.signature(listing).parameters)[1:] if listing else ()
     chosen = parts(place[0]).get(str(section.get("name"))) if len(place) == 1 else None
     return inspect.signature(chosen).parameters if chosen else ()
 

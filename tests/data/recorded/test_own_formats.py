@@ -63,3 +63,9 @@ def test_functions_that_return_something_else_are_named_with_their_file(
 ) -> None:
     with pytest.raises(ConfigError, match=rf"^{__file__}:\d+: format 'feet' {said}"):
         data(tmp_path, returned=returned).sources()
+
+
+def test_values_of_options_are_of_the_annotated_type(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"^data\.options\.rate must be a number, not 'fast'$"):
+        data(tmp_path, rate="fast")
+    assert data(tmp_path, rate=12).options == {"rate": 12}
