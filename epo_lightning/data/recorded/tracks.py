@@ -20,6 +20,7 @@ from jaxtyping import Float, Int
 
 from epo_lightning.data.errors import RecordingError
 from epo_lightning.data.recorded.lanes import FARTHEST, LaneGraph
+from epo_lightning.scene import KINDS
 
 __all__ = ["Recording", "RecordingError", "RecordingSource", "TrackTable"]
 
@@ -27,6 +28,11 @@ FASTEST = 120.0
 """Largest speed [m/s]; more indicates a wrong unit."""
 LONGEST = 40.0
 """Largest length of a vehicle [m]; more indicates a wrong unit."""
+NUMBERING = {
+    "ids": "number texts by np.unique(ids, return_inverse=True)[1]",
+    "kind": f"a kind is an index into KINDS of epo_lightning/scene.py, 0 to {len(KINDS) - 1} for {', '.join(KINDS)}",
+}
+"""How columns of whole numbers are made from texts."""
 
 
 def _first_text(values: np.ndarray) -> str | None:
@@ -82,8 +88,8 @@ class TrackTable:
             sizes: path of the file with the sizes; None if it is the same.
 
         Raises:
-            RecordingError: no rows, numbers of another type or that are not finite, implausible units, or an agent whose
-                frames do not increase or that jumps.
+            RecordingError: no rows, columns of different length, numbers of another type or that are not finite, implausible
+                units, or an agent whose frames do not increase or that jumps.
         """
 
         def first(bad: Any) -> int:
@@ -93,12 +99,14 @@ class TrackTable:
             raise RecordingError(path, "the recording has no tracks; at least one was expected")
         for name in ("agent", "frame", "ids", "kind"):
             if not np.issubdtype((given := getattr(self, name)).dtype, np.integer):
-                raise RecordingError(path, f"{name} is of type {given.dtype}; whole numbers were expected: number them")
+                how = NUMBERING.get(name, "number them")
+                raise RecordingError(path, f"{name} is of type {given.dtype}; whole numbers were expected: {how}")
         for name in ("position", "heading", "velocity", "size"):
             if not np.issubdtype((given := getattr(self, name)).dtype, np.floating):
                 text = _first_text(given)
                 what = f"of type {given.dtype}" if text is None else f"text, such as {text!r}"
                 raise RecordingError(path, f"{name} is {what}; floating-point numbers were expected")
+        self._check_shapes(path)
         if not (np.isfinite(self.rate) and 1.0 <= self.rate <= 1000.0):
             raise RecordingError(path, f"a frame rate of {self.rate} Hz was expected to lie between 1 and 1000 Hz")
         by_agent = np.diff(self.agent)
@@ -154,6 +162,21 @@ class TrackTable:
             )
         return self
 
+    def _check_shapes(self, path: Path | str) -> None:
+        """Refuse columns of another shape than the others have.
+
+        Raises:
+            RecordingError: the column, its shape and the expected one.
+        """
+        rows, agents = len(self.agent), len(self.ids)
+        shapes = {"frame": (rows,), "position": (rows, 2), "heading": (rows,), "velocity": (rows, 2)}
+        for name, shape in {**shapes, "size": (agents, 2), "kind": (agents,)}.items():
+            if (given := np.shape(getattr(self, name))) != shape:
+                column = "agent" if name in shapes else "ids"
+                raise RecordingError(
+                    path, f"{name} has the shape {given}; {shape} was expected, because {column} has {shape[0]} entries"
+                )
+
 
 def together(parts: Sequence[TrackTable]) -> TrackTable:
     """The agents of several tables of one recording in one table, one table after the other; all have the same rate."""
@@ -195,12 +218,23 @@ class RecordingSource:
         files: files of the recording; their contents identify a data set.
         read: function that reads the recording, possibly in another process; it must therefore be a function at module level
             or a partial of one. Raises :class:`RecordingError`.
+
+    Raises:
+        RecordingError: ``read`` is no function.
     """
 
     name: str
     group: str
     files: tuple[Path, ...]
     read: Callable[[], Recording]
+
+    def __post_init__(self) -> None:
+        if not callable(self.read):
+            raise RecordingError(
+                self.files[0] if self.files else self.name,
+                f"the last argument of RecordingSource is a {type(self.read).__name__}; a function was expected, which is "
+                "called when the recording is needed: partial(read, file) instead of read(file)",
+            )
 
 
 def unwrapped(heading: Float[np.ndarray, " n"], begin: Int[np.ndarray, " C"]) -> Float[np.ndarray, " n"]:

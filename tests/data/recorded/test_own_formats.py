@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from epo_lightning.data.errors import RecordingError
 from epo_lightning.data.recorded.recordings import RecordedData
 from epo_lightning.data.recorded.tracks import RecordingSource
 from epo_lightning.registry import ConfigError, register
 
 from .roads import recording
+from .test_plausibility import walking
 
 
 def source(file: Path) -> RecordingSource:
@@ -69,3 +73,38 @@ def test_values_of_options_are_of_the_annotated_type(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"^data\.options\.rate must be a number, not 'fast'$"):
         data(tmp_path, rate="fast")
     assert data(tmp_path, rate=12).options == {"rate": 12}
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "said"),
+    [
+        (
+            "position",
+            lambda given: given[:-1],
+            r"position has the shape \(239, 2\); \(240, 2\) was expected, because agent has",
+        ),
+        ("velocity", lambda given: given[:, 0], r"velocity has the shape \(240,\); \(240, 2\) was expected"),
+        ("kind", lambda given: given[0], r"kind has the shape \(\); \(6,\) was expected, because ids has 6 entries"),
+        (
+            "kind",
+            lambda given: given.astype(str),
+            "kind is of type .*: a kind is an index into KINDS .* for car, van, truck",
+        ),
+        (
+            "ids",
+            lambda given: given.astype(str),
+            r"ids is of type .*: number texts by np\.unique\(ids, return_inverse=True\)\[1\]",
+        ),
+    ],
+)
+def test_columns_of_another_length_or_type_are_named(name: str, change: Callable[[np.ndarray], Any], said: str) -> None:
+    tracks = walking()
+    with pytest.raises(RecordingError, match=f"a.feet: {said}"):
+        dataclasses.replace(tracks, **{name: change(getattr(tracks, name))}).check("a.feet")
+
+
+def test_a_recording_in_the_place_of_its_reader_is_refused() -> None:
+    with pytest.raises(
+        RecordingError, match=r"^a.feet: the last argument .* is a Recording; .*: partial\(read, file\)"
+    ):
+        RecordingSource("a", "a", (Path("a.feet"),), recording())  # type: ignore[arg-type]

@@ -33,6 +33,7 @@ CHANGES = {
     "unchecked": lambda found: dataclasses.replace(
         found, tracks=dataclasses.replace(found.tracks, velocity=np.nan * found.tracks.velocity)
     ),
+    "failing": lambda found: dataclasses.replace(found, unknown=1),
     "uneven": lambda found: dataclasses.replace(
         found, tracks=dataclasses.replace(found.tracks, frame=found.tracks.frame[:-5])
     ),
@@ -193,7 +194,8 @@ def test_a_folder_of_broken_recordings_is_an_error_with_the_first_reason(folder)
     [
         ("mapless", "the recording has no map: set data.map=false, or give it one"),
         ("unchecked", r"velocity \[nan, nan\] of track 7 in frame 0 was expected to be finite"),
-        ("uneven", r"its reader fails at .*\.py:\d+, ValueError"),
+        ("failing", r"its reader fails at .*\.py:\d+, TypeError"),
+        ("uneven", r"frame has the shape \(\d+,\); \(\d+,\) was expected, because agent has \d+ entries"),
     ],
 )
 def test_a_recording_without_a_map_or_with_impossible_tracks_is_left_out_and_named(folder, change, said):
