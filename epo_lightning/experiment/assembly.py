@@ -31,6 +31,7 @@ from epo_lightning.experiment.config.replaced import keys_of
 from epo_lightning.experiment.config.settings import PARTS, Settings, TrainerSettings
 from epo_lightning.experiment.dashboards import mlflow
 from epo_lightning.forecasters import SUPPLIED, Forecaster, build_forecaster
+from epo_lightning.game.features import OWN_FEATURES
 from epo_lightning.metrics.forecast import scores
 from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.run_folder import RunFolder
@@ -81,6 +82,26 @@ def refuse_missing_folder(data: Any, given: Collection[str]) -> None:
         )
 
 
+def refuse_unread_bounds(energy: Mapping[str, Any], given: Collection[str]) -> None:
+    """Refuse bounds that the user has set and no feature of the energy reads. (Files of energies may have further bounds.)
+
+    Args:
+        energy: the section of the energy.
+        given: keys that the user has set.
+
+    Raises:
+        ConfigError: a bound without effect.
+    """
+    own = energy.get("own") or ()
+    signals = [signal for signal in energy.get("bounds") or () if f"energy.bounds.{signal}" in given]
+    for name, feature in OWN_FEATURES.items():
+        if feature.bounded and feature.signal in signals and name not in own:
+            raise ConfigError(
+                f"energy.bounds.{feature.signal} is read by the feature {name}, which energy.own ({', '.join(own)}) does "
+                "not have: add it, or leave the bound out"
+            )
+
+
 def build(settings: Settings, overrides: Sequence[str] = ()) -> tuple[Any, Forecaster]:
     """The data module and the forecaster of a run. Initial weights are drawn from the global random state; no data is read.
 
@@ -95,6 +116,7 @@ def build(settings: Settings, overrides: Sequence[str] = ()) -> tuple[Any, Forec
         mlflow.check_settings(settings.logger.mlflow)
     data = build_data(settings.data)
     refuse_missing_folder(data, keys_of(overrides))
+    refuse_unread_bounds(settings.energy, keys_of(overrides))
     # The order of the batches belongs to the run; data.seed draws the scenes and splits.
     data.order_seed = settings.seed
     check_divisible(getattr(data, "batch_size", settings.trainer.devices), settings.trainer.devices)

@@ -30,6 +30,9 @@ MISTAKES = {
     "train forecaster.name=epos": "'epo'",
     "train logger=[wand]": "'wandb'",
     "train energy.own=[gaol]": "'goal'",
+    "train experiment=rpi/v_lstm_epo_game energy.own=[goal,accb] energy.bounds.vel=[0,1]": (
+        "energy.bounds.vel is read by the feature velb, which energy.own (goal, accb) does not have: add it, or leave the"
+    ),
     "train seed=one": "seed must be a whole number",
     "train optimizer.lr=fast": "optimizer.lr must be a number",
     "train forecaster.modes=1.5": "forecaster.modes must be a whole number",
