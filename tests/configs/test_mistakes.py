@@ -20,6 +20,11 @@ MISTAKES = {
     "config check train data=exid data.history=12": "in data: it is data.windows.history",
     "train +data.foo=1": "data.foo",
     "train solver.step=3": "'steps'",
+    "train objective.weights={imitation:2.0,probabilty:1}": (
+        "unknown key 'objective.weights.probabilty' in objective.weights: did you mean 'probability'?"
+    ),
+    "config check train data=exid data.windows={dt:0.2,histori:12}": "in data.windows: did you mean 'history'?",
+    "train +objective.power=2": "objective.power has a value, so leave out the plus: objective.power=2",
     "config check train data=eth data.options.video_rat=10": "'data.options.video_rat': did you mean 'video_rate'?",
     "config check train data=eth data.options.video_rate=10": "set it by +data.options.video_rate=<value>",
     "config check train data=dut data.options.rate=fast": "data.options.rate must be a number, not 'fast'",

@@ -54,7 +54,13 @@ def one_sentence(instance: Hydra, name: str, overrides: Sequence[str]) -> Iterat
         if unknown and (relative := re.fullmatch(r"experiment/(?:[\w-]+/)*([\w-]+)@[\w.-]+", unknown.group(1))):
             raise ConfigError(_override(instance, relative.group(1), "<option>", overrides)) from error
         if unknown and "Multiple values" not in str(error):
-            raise ConfigError(_unknown_key(instance, name, unknown.group(1), overrides)) from error
+            below = str(
+                getattr(error.__cause__, "full_key", None)
+            )  # of a mapping: objective.weights={imitation: 1, foo: 1}
+            key = below if below.startswith(f"{unknown.group(1)}.") else unknown.group(1)
+            raise ConfigError(_unknown_key(instance, name, key, overrides)) from error
+        if known := re.search(r"An item is already at '(.+)'\.\s+Either remove \+ prefix: '(.+)'", str(error)):
+            raise ConfigError(f"{known.group(1)} has a value, so leave out the plus: {known.group(2)}") from error
         raise ConfigError(_in_file(str(error)) or sentence(error)) from error
     except ValueError as error:  # Hydra's own, for example debug=null
         if isinstance(error, ConfigError):
