@@ -72,7 +72,8 @@ class Combination:
             (objective, self.objective.needs_from_solver),
         ):
             if needed and not needed & self.solver.provides:  # one of them is enough
-                return f"{part} needs {_or(needed)}, and {solver} as it is set provides {_or(self.solver.provides)}"
+                provided = _or(self.solver.provides) or _nothing()
+                return f"{part} needs {_or(needed)}, and {solver} as it is set provides {provided}"
         if self.objective.through_solution and not self.backward.teaches:
             return f"{objective} learns through the solution, which has no derivative with {backward}"
         if self.backward.teaches and not self.objective.through_solution:
@@ -125,3 +126,15 @@ def _and(what: Iterable[str]) -> str:
 
 def _or(what: Iterable[str]) -> str:
     return " or ".join(WORDS[word] for word in sorted(what))
+
+
+def _nothing() -> str:
+    """What a solver of one's own provides if it declares nothing, and what the declarations are for."""
+    needs = {name: getattr(part, "needs_from_solver", ()) for name, part in parts("backward").items()}
+    uses = [
+        f"{' or '.join(sorted(map(str.upper, words)))} for backward={name}" for name, words in needs.items() if words
+    ]
+    return (
+        "nothing, because its `provides` is empty: declare there what its solutions have "
+        f"({', '.join(uses)}; from epo_lightning.solvers.base)"
+    )

@@ -11,9 +11,14 @@ import torch
 from games import random_scene
 from suites import model
 
+from epo_lightning import registry
 from epo_lightning.experiment.config.compose import compose
+from epo_lightning.forecast import GameParameters, Solution
 from epo_lightning.forecasters import build_forecaster
+from epo_lightning.game.energy import Energy
 from epo_lightning.registry import ConfigError
+from epo_lightning.scene import Scene
+from epo_lightning.solvers.base import Minimiser
 
 OPTIONS = {
     "energy": ("rpi", "augmented_rpi", "neural", "collision", "convex"),
@@ -118,6 +123,25 @@ def test_newton_steps_are_not_differentiated_through_steps(backward: str) -> Non
         r"backward=implicit",
     ):
         build_forecaster(configuration(chosen))
+
+
+class Plain(Minimiser):
+    """A solver of one's own that declares nothing."""
+
+    def __call__(self, energy: Energy, scene: Scene, parameters: GameParameters) -> Solution:
+        raise NotImplementedError
+
+
+def test_a_solver_that_declares_nothing_is_told_so_and_what_it_works_with(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(registry._PARTS["solver"], "plain", Plain)
+    chosen = {"energy": "rpi", "solver": "levenberg_marquardt", "backward": "unrolled", "objective": "imitation"}
+    with pytest.raises(
+        ConfigError,
+        match=r"and solver=plain as it is set provides nothing, because its `provides` is empty: declare there .*STATIONARY "
+        r"for backward=implicit, STEPS for backward=truncated, PATH or TABLES for backward=unrolled; .* instead it works: "
+        r".*solver=levenberg_marquardt",
+    ):
+        build_forecaster({**configuration(chosen), "solver": {"name": "plain"}})
 
 
 def options_of(kinds: tuple[str, ...]) -> itertools.product:
