@@ -30,15 +30,18 @@ def check_needs(energy: Energy, task: Task) -> None:
     """Refuse an energy that needs fields which the data does not provide.
 
     Raises:
-        ConfigError: the message names the missing fields.
+        ConfigError: the message names the features, the missing fields, and rows for such data.
     """
     known = {"size", "context", "order", "reference_controls"} | (
         {"goals", "goal_headings"} if task.candidates else set()
     )
     lacking = energy.needs - known - ({"reference", "reference_speed"} if task.candidates > 1 else set())
     if lacking:
+        names = [name for name in energy.own if name in OWN_FEATURES and OWN_FEATURES[name].needs in lacking]
+        rows = "rpi/..." if task.candidates else "dut/... or ucy/..."
         raise ConfigError(
-            f"features of energy.own need {', '.join(sorted(lacking))}, which this data does not provide: leave the "
+            f"features of energy.own ({', '.join(names)}) need {', '.join(sorted(lacking))}, which this data does not "
+            f"provide: choose a row for such data, experiment={rows} (without experiment=, the energy is RPI's), leave the "
             "features out, or choose data with a map"
         )
 

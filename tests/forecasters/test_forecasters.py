@@ -175,7 +175,11 @@ def test_the_decoder_of_margins_leaves_the_other_networks_as_they_are():
         ({"energy": {"name": "features", "own": ["gaol"]}}, "did you mean 'goal'"),
         (
             {"energy": {"name": "features", "own": ["lane", "velref"]}},
-            "need reference, reference_speed, which this data does not provide",
+            r"energy\.own \(lane, velref\) need reference, reference_speed, which this data does not provide: choose .*rpi/",
+        ),
+        (
+            {"candidates": 0},
+            r"energy\.own \(goal\) need goals, .* experiment=dut/\.\.\. or ucy/\.\.\. \(without experiment=",
         ),
         ({"energy": {"name": "features"}}, r"missing key energy\.own"),
         (
