@@ -231,10 +231,8 @@ def manifest(folder: Path, command: str = "", config: Mapping[str, Any] | None =
         CacheError: no data set, an unreadable manifest, one of another format, or of another configuration.
     """
     if not folder.is_dir():
-        kind = folder.name.partition("-")[0].upper()
-        others = "and any other data.* settings and --config-dir of this command"
-        hint = f"; make it with `{command}`, {others}" if command else ""
-        raise CacheError(f"no {kind} data at {folder}{hint}")
+        hint = f"; make it with `{command}` and all data.* settings and --config-dir of this command" if command else ""
+        raise CacheError(f"no {folder.name.rpartition('-')[0]} data at {folder}{hint}")
     path = folder / MANIFEST
     try:
         content = json.loads(path.read_text())

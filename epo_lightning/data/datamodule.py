@@ -10,6 +10,7 @@ a random order, ``TOGETHER`` of them at a time, whose scenes are shuffled; the n
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator, Sequence
 from typing import Any, Protocol
 
@@ -198,11 +199,13 @@ class SceneDataModule(LightningDataModule):
         num_agents: number of agents per scene N.
         history: number of observed steps H; None if it is not known before a scene is read.
         order_seed: seed of the order of batches; the data's own seed unless a run sets its own.
+        words: the words of the user's command that choose this data, for error messages.
     """
 
     task: Task
     num_agents: int
     history: int | None = None
+    words: Sequence[str] = ()
 
     def __init__(self, batch_size: int, seed: int, share: float = 1.0) -> None:
         super().__init__()
@@ -220,6 +223,14 @@ class SceneDataModule(LightningDataModule):
     def open(self, split: str) -> SceneDataset:
         """The data set of a split, read from disk."""
         raise NotImplementedError(f"{type(self).__name__} does not define how a split is opened")
+
+    def generation(self, *words: str) -> str:
+        """The command ``epo generate`` with some words, or the user's own for the same keys, and the user's further ones."""
+        known = {
+            word if word.startswith("--") else word.lstrip("+").partition("=")[0]: word
+            for word in (*words, *self.words)
+        }
+        return shlex.join(["epo", "generate", *known.values()])
 
     def setup(self, stage: str | None = None) -> None:
         """Open the splits that a stage needs. The test split is read only by the stages ``test`` and ``predict``."""

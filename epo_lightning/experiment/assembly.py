@@ -64,6 +64,11 @@ def describe_model(settings: Settings, data: Any) -> dict[str, Any]:
     return {**sections, "goal": settings.goal, **data.task.to_config()}
 
 
+def words_of_data(overrides: Sequence[str]) -> list[str]:
+    """The words of a command that choose its data: overrides of ``data``, and folders of configurations."""
+    return [word for word in overrides if word.lstrip("+").startswith(("data=", "data.", "--config-dir="))]
+
+
 def refuse_missing_folder(data: Any, given: Collection[str]) -> None:
     """Refuse a folder of recordings that the user has named and that does not exist, because a misspelt name would have the
     same effect as no folder: the cache would be searched for a data set of these settings.

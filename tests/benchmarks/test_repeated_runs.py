@@ -35,7 +35,7 @@ def test_a_run_of_a_results_file_is_trained_again(capsys, tmp_path):
     saved.scores["metrics.json"]["metrics"]["minSFDE"] += 0.25
     assert repeat.distance(saved, again)[0] == pytest.approx(0.25)
     repeat.main([str(file), "data.root=nowhere", "--out", str(tmp_path / "third")])
-    assert "not repeated: no RPI data at nowhere" in capsys.readouterr().out
+    assert "not repeated: no rpi data at nowhere" in capsys.readouterr().out
 
 
 def test_numbers_of_two_logs_are_compared():

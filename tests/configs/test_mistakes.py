@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from experiment import tiny
 from experiment.conftest import Epo, epo, refused  # noqa: F401 - fixtures
 
 from epo_lightning.experiment.config.compose import compose, jobs
@@ -118,7 +119,8 @@ def test_a_mistyped_row_is_answered_by_the_rows_beside_it(row: str, hint: str, r
 
 
 def test_missing_data_is_reported_before_a_folder_is_made(refused: Callable[..., str]) -> None:  # noqa: F811
-    assert "epo generate" in refused("train", "experiment=rpi/v_lstm", "data.root=nowhere")
+    said = refused("train", "experiment=rpi/v_lstm", "data.root=nowhere", "data.batch_size=8")
+    assert f"`epo generate data=rpi data.root=nowhere data.batch_size=8 --config-dir={tiny.CONF}`" in said
 
 
 def test_an_option_of_a_folder_that_is_not_on_the_search_path_is_looked_for(

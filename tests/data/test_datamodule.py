@@ -270,6 +270,13 @@ def test_data_of_earlier_versions_keep_their_digest_and_command():
     assert today.command == "epo generate data=rpi data.placements=8 data.split=hard"
 
 
+def test_the_command_that_makes_a_data_set_has_the_words_of_the_users_command():
+    data = RPIData(split="hard")
+    data.words = ["data=own", "+data.split=hard", "data.batch_size=8", "--config-dir=a", "--config-dir=b"]
+    own = "data=own data.recipe=1 +data.split=hard data.batch_size=8 --config-dir=a --config-dir=b"
+    assert data.command == f"epo generate {own}"
+
+
 def test_the_digest_follows_what_a_run_depends_on(tmp_path):
     base = RPIData(root=str(tmp_path)).digest
     assert RPIData(batch_size=64).digest == base

@@ -226,7 +226,7 @@ def test_paper_sizes_and_disjoint_hard_split():
 
 def test_a_missing_set_names_the_command(tmp_path):
     data = RPIData(root=str(tmp_path), **SMALL)
-    with pytest.raises(cache.CacheError, match=r"no RPI data at .*`epo generate data=rpi data.seed=1 data.games=3"):
+    with pytest.raises(cache.CacheError, match=r"no rpi data at .*`epo generate data=rpi data.seed=1 data.games=3"):
         data.setup("fit")
 
 

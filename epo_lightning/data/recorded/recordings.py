@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import shutil
 import warnings
 from collections import Counter
@@ -275,7 +274,7 @@ class RecordedData(SceneDataModule):
         words = [f"data={self.dataset_name}", f"data.folder={self.folder_of_recordings}"]
         if self.root != cache.default_root():
             words.append(f"data.root={self.root}")
-        return shlex.join(["epo", "generate", *words])
+        return self.generation(*words)
 
     def generate(
         self, workers: int | None = None, progress: bool = True, strict: bool = False, launch: Launch | None = None

@@ -187,7 +187,7 @@ class RPIData(SceneDataModule):
             words.append("data.sizes=" + ("null" if self.sizes is None else "[" + ",".join(map(str, self.sizes)) + "]"))
         if self.root != cache.default_root():
             words.append(f"data.root={self.root}")
-        return " ".join(["epo generate data=rpi", *words])
+        return self.generation("data=rpi", *words)
 
     def generate(self, workers: int | None = None, progress: bool = True) -> Path:
         """Make the data set unless it exists already, and return its folder.

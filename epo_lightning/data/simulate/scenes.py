@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -92,7 +91,7 @@ class SimulatedHighway(RecordedData):
             words.append(f"++data.traffic={self.traffic}")  # whether or not its file has this setting
         if self.root != cache.default_root():
             words.append(f"data.root={self.root}")
-        return shlex.join(["epo", "generate", *words])
+        return self.generation(*words)
 
     def recordings(self) -> list[RecordingSource]:
         """The simulated recordings, listed by the reader of exiD's format."""
