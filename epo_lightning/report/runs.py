@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatch
@@ -87,11 +88,15 @@ def find_runs(folder: str | Path) -> list[RunFolder]:
     """All runs in and below a folder, in the order of their paths.
 
     Raises:
-        ConfigError: no folder, no run (with the command that makes one), or scores of a run that lost its records.
+        ConfigError: no folder (with the nearest one), no run (with the command that makes one), or scores of a run that lost
+            its records.
     """
     folder = Path(folder).expanduser()
     if not folder.is_dir():
-        raise ConfigError(f"no folder {folder} to report on: {TRAIN}")
+        beside = [entry.name for entry in folder.parent.iterdir() if entry.is_dir()] if folder.parent.is_dir() else []
+        close = difflib.get_close_matches(folder.name, beside, n=1)
+        advice = f"did you mean {folder.parent / close[0]}?" if close else TRAIN
+        raise ConfigError(f"no folder {folder} to report on: {advice}")
     known = list(discover(folder))
     for record in folder.rglob("run.json"):
         _require_records(RunFolder(record.parent))

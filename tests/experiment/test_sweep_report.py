@@ -143,5 +143,9 @@ def test_sweeps_that_cannot_be_reported_are_refused(runs: Path) -> None:
         report(ReportSettings(sweep="rpi_main"))
     with pytest.raises(ConfigError, match="rpi_main"):
         report(ReportSettings(sweep="rpi_mian"))
+    with pytest.raises(
+        ConfigError, match=r"no sweep runs/a has .*; `epo report runs=runs/a` reports on runs in a folder"
+    ):
+        report(ReportSettings(sweep="runs/a"))
     assert json.loads((runs / "sweeps/rpi_main/sweep.json").read_text())["name"] == "rpi_main"
     assert not (runs / "sweeps" / "rpi_main" / "report").exists()

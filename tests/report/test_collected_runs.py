@@ -81,6 +81,9 @@ def test_collect_names_missing_scores_and_the_command_for_them(tmp_path: Path) -
         collect(tmp_path / "nowhere")
     with pytest.raises(ConfigError, match=r"no run in or below .*epo train"):
         collect(tmp_path)
+    (tmp_path / "mine").mkdir()
+    with pytest.raises(ConfigError, match=rf"no folder .*/mien to report on: did you mean {tmp_path}/mine\?$"):
+        collect(tmp_path / "mien")
     make_run(tmp_path / "a", "V-LSTM", "marginal", None)
     with pytest.raises(ConfigError, match=rf"none of the 1 runs.*epo evaluate runs={tmp_path}"):
         collect(tmp_path)

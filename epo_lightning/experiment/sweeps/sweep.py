@@ -31,6 +31,7 @@ from epo_lightning.files import read_json, write_file, write_json
 from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.entries import OBJECT, OBJECTS, TEXT, TEXTS, WHOLE, Check, check_entries, check_known
+from epo_lightning.report.labels import word as override
 from epo_lightning.run_folder import LOCK, RunFolder
 
 State = Literal["done", "running", "interrupted", "trained, not scored", "failed", "waiting"]
@@ -108,8 +109,11 @@ class Sweep:
         if not alike or exact != name:
             what = f"{name} with these overrides" if exact != name else name
             begun = "; ".join(f"{key} ({sweep.record.get('command')})" for key, sweep in known.items())
+            of_runs = (
+                f"; `epo report {override('runs', name)}` reports on runs in a folder" if Path(name).is_dir() else ""
+            )
             raise ConfigError(
-                f"no sweep {what} has begun below {home}: " + (f"known: {begun}" if begun else "none has")
+                f"no sweep {what} has begun below {home}: " + (f"known: {begun}" if begun else "none has") + of_runs
             )
         return alike[0]
 
