@@ -15,7 +15,7 @@ from epo_lightning.registry import ConfigError
 from epo_lightning.report.paper import has_values
 from epo_lightning.report.render import code
 from epo_lightning.report.results import read_results, results_name, save_results
-from epo_lightning.report.runs import EvaluatedRun, collect, scored, scored_elsewhere
+from epo_lightning.report.runs import EvaluatedRun, collect, none_evaluated, scored, scored_elsewhere
 from epo_lightning.report.tables import build_tables, distinct
 from epo_lightning.report.write import Report, is_measured, is_timed, why_left_out, write_report
 
@@ -96,8 +96,8 @@ def of_sweep(sweep: Sweep) -> Report:
     done = [job for job in jobs if is_measured(job.run)]
     if not done:
         raise ConfigError(
-            f"none of the {len(jobs)} runs of the sweep {sweep.label} is evaluated: `epo sweep status {sweep.label}` says "
-            f"how far they are, epo evaluate runs={os.path.relpath(sweep.root)} evaluates those that are finished"
+            f"{none_evaluated(len(jobs), f'of the sweep {sweep.label}')}: `epo sweep status {sweep.label}` says how far the "
+            f"sweep is, epo evaluate runs={os.path.relpath(sweep.root)} evaluates what is finished"
         )
     asked = {job.run.path: job.measures for job in jobs}
     with_scores = [job.run for job in done if scored(job.run)]

@@ -147,9 +147,14 @@ def collect(runs: str | Path | Iterable[Records]) -> list[EvaluatedRun]:
         begun = next((run for run in known if RECORD in run.names()), known[0])
         open_ones = [run for run in known if RECORD in run.names() and _status(run) != FINISHED]
         remedy = f"epo evaluate runs={runs}" if isinstance(runs, str | Path) else f"epo evaluate run={begun.path}"
-        first = f"; before it, epo train resume={open_ones[0].path} continues an unfinished run" if open_ones else ""
-        raise ConfigError(f"none of the {len(known)} runs {where} is evaluated: {remedy} does it{first}")
+        first = f"epo train resume={open_ones[0].path} continues an unfinished run, and then " if open_ones else ""
+        raise ConfigError(f"{none_evaluated(len(known), where)}: {first}{remedy} does it")
     return found
+
+
+def none_evaluated(count: int, where: str) -> str:
+    """Statement that no run is evaluated, in a place such as ``below runs``."""
+    return f"the only run {where} is not evaluated" if count == 1 else f"none of the {count} runs {where} is evaluated"
 
 
 def _status(run: Records) -> Any:

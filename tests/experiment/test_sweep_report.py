@@ -139,7 +139,9 @@ def test_a_sweep_that_measures_scores_and_time_is_reported(runs: Path) -> None:
 def test_sweeps_that_cannot_be_reported_are_refused(runs: Path) -> None:
     make_run(runs / "a", "V-LSTM", "marginal", None)
     begin(runs, "rpi_main", {"a": None})
-    with pytest.raises(ConfigError, match=r"none of the 1 runs of .* is evaluated: .*epo evaluate runs=runs "):
+    with pytest.raises(
+        ConfigError, match=r"the only run of the sweep rpi_main is not evaluated: .*epo evaluate runs=runs "
+    ):
         report(ReportSettings(sweep="rpi_main"))
     with pytest.raises(ConfigError, match="rpi_main"):
         report(ReportSettings(sweep="rpi_mian"))

@@ -71,7 +71,9 @@ def test_a_report_may_contain_chosen_runs_only(tmp_path: Path) -> None:
     assert [run.path.name for run in find_runs(tmp_path)] == ["a", "b", "begun", "c"]
     with pytest.raises(ConfigError, match=r"no run of this report: .*epo train"):
         collect([])
-    first = rf"epo evaluate run={begun.path} does it; before it, epo train resume={begun.path} "
+    first = (
+        rf"epo train resume={begun.path} continues an unfinished run, and then epo evaluate run={begun.path} does it"
+    )
     with pytest.raises(ConfigError, match=rf"none of the 2 runs of this report is evaluated: {first}"):
         collect([waiting, begun])
 
@@ -85,7 +87,9 @@ def test_collect_names_missing_scores_and_the_command_for_them(tmp_path: Path) -
     with pytest.raises(ConfigError, match=rf"no folder .*/mien to report on: did you mean {tmp_path}/mine\?$"):
         collect(tmp_path / "mien")
     make_run(tmp_path / "a", "V-LSTM", "marginal", None)
-    with pytest.raises(ConfigError, match=rf"none of the 1 runs.*epo evaluate runs={tmp_path}"):
+    with pytest.raises(
+        ConfigError, match=rf"the only run in or below .* is not evaluated: .*epo evaluate runs={tmp_path}"
+    ):
         collect(tmp_path)
     make_run(tmp_path / "b", "V-LSTM", "marginal", scores(0.3))
     assert [run.path.name for run in collect(tmp_path)] == ["b"]
