@@ -61,7 +61,8 @@ MISTAKES = {
     "train forecaster=constant_velocity goal=all": "has no network of its own: use goal=energy",
     "train backbone.width=0": "backbone.width=0",
     "train optimizer.lr=-1": "optimizer.lr",
-    "train seed=0,1": "--multirun",
+    "train seed=0,1": "seed=0,1 has several values: for a run of each, add -m, or use a sweep",
+    "train experiment=rpi/v_lstm,rpi/v_lstm_sc": "epo: experiment=rpi/v_lstm,rpi/v_lstm_sc has several values: for a run of",
     "train seed=-1": "seed",
     "train trainer.max_epochs=null": "would never end",
     "train -m sweeps=rpi_mein": "'rpi_main'",
@@ -108,7 +109,9 @@ def test_a_training_of_nothing_in_particular_is_refused(refused: Callable[..., s
     ("row", "hint"),
     [
         ("us101/v_lstm_ep", "did you mean 'us101/v_lstm_epo'? known: us101/const_vel, us101/hivt_m, "),
-        ("v_lstm_epo", "known: argoverse2/..., dut/..., exid/..., "),
+        ("v_lstm_ep", "known: argoverse2/..., dut/..., exid/..., "),
+        ("v_lstm_epo", "did you mean argoverse2/v_lstm_epo, dut/v_lstm_epo, exid/v_lstm_epo, "),
+        ("v_lstm_epo_game", "did you mean rpi/v_lstm_epo_game?"),
     ],
 )
 def test_a_mistyped_row_is_answered_by_the_rows_beside_it(row: str, hint: str, refused: Callable[..., str]) -> None:  # noqa: F811

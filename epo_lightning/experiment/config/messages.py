@@ -61,6 +61,11 @@ def one_sentence(instance: Hydra, name: str, overrides: Sequence[str]) -> Iterat
             raise ConfigError(_unknown_key(instance, name, key, overrides)) from error
         if known := re.search(r"An item is already at '(.+)'\.\s+Either remove \+ prefix: '(.+)'", str(error)):
             raise ConfigError(f"{known.group(1)} has a value, so leave out the plus: {known.group(2)}") from error
+        if several := re.search(r"Ambiguous value for argument '(.+?)'", str(error)):
+            raise ConfigError(
+                f"{several.group(1)} has several values: for a run of each, add -m, or use a sweep; a text with a comma "
+                "needs quotes of its own, \"key='a,b'\""
+            ) from error
         raise ConfigError(_in_file(str(error)) or sentence(error)) from error
     except ValueError as error:  # Hydra's own, for example debug=null
         if isinstance(error, ConfigError):
@@ -171,8 +176,11 @@ def _missing_option(instance: Hydra, missing: str, message: str) -> str:
 def _known(option: str, options: Sequence[str]) -> str:
     """A hint for an option that does not exist: the nearest one, then the options of its folder or, failing that, all.
 
-    Where options lie in folders, as the rows of all data sets do, the folders stand for them.
+    Where options lie in folders, as the rows of all data sets do, the folders stand for them. An option without its folder
+    is named in all folders that have it.
     """
+    if same := [name for name in options if name.endswith(f"/{option}")]:
+        return f"did you mean {', '.join(same)}?"
     folder = option.rpartition("/")[0] + "/"
     if beside := [name for name in options if name.startswith(folder)]:
         return nearest(option, beside)
