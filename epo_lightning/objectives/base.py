@@ -70,8 +70,12 @@ def checked_weights(
     Raises:
         ConfigError: a missing or unknown name, a value that is not a weight, or only weights of 0.
     """
-    if set(weights) != set(names):
-        raise ConfigError(f"{key} must name {list(names)}, not {sorted(weights)}")
+    differences = {"unknown": set(weights) - set(names), "missing": set(names) - set(weights)}
+    if found := [f"{what}: {', '.join(sorted(some))}" for what, some in differences.items() if some]:
+        raise ConfigError(
+            f"{key} must name {', '.join(names)} ({'; '.join(found)}); a new term needs an objective of its own "
+            "(docs/extend.md)"
+        )
     for name, value in weights.items():
         if not is_number(value) or not 0 <= value < math.inf:
             raise ConfigError(f"{key}.{name} must be a number, 0 or more, not {value!r}")
