@@ -67,7 +67,7 @@ def evaluate(config: dict[str, Any], overrides: Sequence[str] = ()) -> list[tupl
             print(f"{run.path}: left out, {error}")
     if refused and not scored:
         where = "" if settings.data is None else " on this data"
-        raise ConfigError(f"none of the {len(refused)} runs can be scored{where}: {refused[0]}")
+        raise ConfigError(f"no run in or below {settings.runs} can be scored{where}: {refused[0]}")
     return scored
 
 

@@ -209,12 +209,12 @@ def check_fits(forecaster: Forecaster, data: Any, name: str) -> None:
         ConfigError: another time step or horizon, goals that are not given or not candidates, or no sizes.
     """
     task, other = forecaster.task, data.task
-    for key, unit in (("dt", " s"), ("horizon", " steps")):
+    for key, what, unit in (("dt", "time step", " s"), ("horizon", "horizon", " steps")):
         mine, theirs = getattr(task, key), getattr(other, key)
         if abs(mine - theirs) > 1e-9:
             raise ConfigError(
-                f"the run forecasts with {key} {mine:g}{unit}, and data={name} has {theirs:g}{unit}: only recordings are "
-                "read with another time step and horizon"
+                f"the run forecasts with {key} {mine:g}{unit}, and data={name} has {theirs:g}{unit}, and cannot be read "
+                f"with another {what}: choose data of recordings, such as data=ucy or data=us101"
             )
     model = forecaster.configuration
     reads_goals = bool(model.get("goal") == "all" or _uses_goals(forecaster))

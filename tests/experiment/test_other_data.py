@@ -235,9 +235,10 @@ def test_what_does_not_fit_is_refused_with_a_reason(
     message = refused("evaluate", run, "data=ucy", folder, "data.windows.dt=0.4")
     assert "data.windows.dt=0.4 does not fit the run, whose forecaster has dt 0.2: leave it out" in message
     assert "horizon 20: leave it out" in refused("predict", run, "out=o", "data=ucy", folder, "data.windows.horizon=12")
-    assert "the run forecasts with dt 0.2 s, and data=drawn has 0.1 s" in refused(
-        "evaluate", run, "data=drawn", "data.like=rpi"
+    said = (
+        "with dt 0.2 s, and data=drawn has 0.1 s, and cannot be read with another time step: choose data of recordings"
     )
+    assert said in refused("evaluate", run, "data=drawn", "data.like=rpi")
     assert "reads each agent's given goal, which data=ucy does not have: train a row without" in refused(
         "evaluate", game, "data=ucy", folder
     )
@@ -323,7 +324,7 @@ def test_all_runs_on_several_data_sets_and_the_table_of_them(
     assert epo("evaluate", "runs=runs", "data=ucy", f"data.folder={folder}", "workers=1") == 0
     printed = capsys.readouterr().out
     assert "runs/rpi: left out, the run reads each agent's given goal" in printed
-    assert "none of the 1 runs can be scored on this data" in refused(
+    assert "no run in or below runs/rpi can be scored on this data" in refused(
         "evaluate", "runs=runs/rpi", "data=ucy", f"data.folder={folder}"
     )
     assert (

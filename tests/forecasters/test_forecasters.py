@@ -197,7 +197,7 @@ def test_the_decoder_of_margins_leaves_the_other_networks_as_they_are():
         ({"optimizer": {"name": "adam", "schedule": "cosin"}}, "did you mean 'cosine'"),
         (
             {"objective": {"name": "imitation", "weights": {"imitation": 1.0, "probability": 1.0, "final": 1.0}}},
-            r"objective\.weights must name imitation, .* \(unknown: final; missing: goal, initial\); a new term needs an obj",
+            r"objective\.weights must name imitation, .* \(unknown: final; missing: goal, initial\); a new term",
         ),
         ({"forecaster": {**EPO, "modes": 0}}, "modes must be 1 or more"),
         ({"speed": 1}, "unknown key 'speed'"),
