@@ -242,6 +242,12 @@ def test_a_check_without_the_data_says_in_one_line_what_is_missing(
         ),
         (
             "experiment/mine.yaml",
+            "# @package _global_\ndefaults: [rpi/v_lstm, _self_]\nsolver: {step_size 0.3}",
+            "experiment=mine",
+            r"^in /.*experiment/mine\.yaml, `step_size 0\.3` lacks a colon: write `step_size: 0\.3`$",
+        ),
+        (
+            "experiment/mine.yaml",
             "title: mine",
             "experiment=mine",
             "mine.yaml must begin with the line `# @package _glo",

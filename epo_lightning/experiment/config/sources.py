@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pickle
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra.core.object_type import ObjectType
@@ -12,6 +12,7 @@ from hydra.plugins.config_source import ConfigLoadError, ConfigResult
 from omegaconf import Container, DictConfig, ListConfig, OmegaConf
 from yaml import YAMLError
 
+from epo_lightning.identity import leaves
 from epo_lightning.registry import ConfigError
 
 if TYPE_CHECKING:
@@ -49,6 +50,7 @@ class ParsedOnce(FileConfigSource):
                     f"{file} must begin with the line `# @package _global_`, as every file in {group}/ does "
                     "(in UTF-8 without a byte order mark)"
                 )
+            _check_colons(file, loaded.config)
             _PARSED[key] = pickle.dumps(loaded)
         # Hydra changes what it is given, so that every composition gets a copy.
         result: ConfigResult = pickle.loads(_PARSED[key])
@@ -60,6 +62,20 @@ def _where(file: Path, error: Exception) -> str:
     mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
     line = "" if mark is None else f":{mark.line + 1}"
     return f"{file}{line} is not YAML: {' '.join(str(problem or error).split())}"
+
+
+def _check_colons(file: Path, config: Container) -> None:
+    """Refuse a key with a blank and without a value: ``{steps 3}`` is the key ``steps 3`` in YAML.
+
+    Raises:
+        ConfigError: the file, and what to write.
+    """
+    values: Any = OmegaConf.to_container(config, resolve=False)
+    for key, value in leaves(values) if isinstance(values, dict) else ():
+        place, blank, given = key.partition(" ")
+        if blank and value is None:
+            name = place.rpartition(".")[2]
+            raise ConfigError(f"in {file}, `{name} {given}` lacks a colon: write `{name}: {given}`")
 
 
 class TreeSource(ParsedOnce):
