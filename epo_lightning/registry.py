@@ -186,12 +186,13 @@ def check_keys(group: str, config: Mapping[str, Any], supplied: Iterable[str] = 
         supplied: arguments that the caller hands over in code and a configuration must not set.
 
     Raises:
-        ConfigError: a missing ``name``, an unknown part, an unknown key (with the nearest known one) or a missing key.
+        ConfigError: a missing ``name``, an unknown part, one whose parameters have no names, an unknown key (with the
+            nearest known one) or a missing key.
     """
     if not config.get("name"):
         _load(group)
         raise ConfigError(f"{group}.name is missing: {nearest('', _PARTS.get(group, {}))}")
-    schema = inspect.signature(lookup(group, config["name"])).parameters
+    schema = _schema(group, config["name"])
     keys = set(config) - {"name"}
     known = set(schema) - set(supplied)
     for key in sorted(keys - known):
@@ -199,6 +200,23 @@ def check_keys(group: str, config: Mapping[str, Any], supplied: Iterable[str] = 
     required = {key for key, argument in schema.items() if argument.default is argument.empty}
     for key in sorted(required - keys - set(supplied)):
         raise ConfigError(f"missing key {group}.{key} for {group} {config['name']!r}")
+
+
+def _schema(group: str, name: str) -> Mapping[str, inspect.Parameter]:
+    """The parameters of a part's constructor, all of which have names.
+
+    Raises:
+        ConfigError: no such part, or ``*args`` or ``**kwargs`` among the parameters.
+    """
+    part = lookup(group, name)
+    schema = inspect.signature(part).parameters
+    for argument in schema.values():
+        if argument.kind in (argument.VAR_POSITIONAL, argument.VAR_KEYWORD):
+            raise ConfigError(
+                f"{group} {name!r} ({place(part)}) takes {argument}, but the signature of a part is the schema of its "
+                "configuration: name all its parameters, also those that it hands to its base class"
+            )
+    return schema
 
 
 def build(group: str, config: Mapping[str, Any], **supplied: Any) -> Any:

@@ -8,7 +8,7 @@ from importlib import import_module
 import pytest
 
 from epo_lightning import registry
-from epo_lightning.registry import ConfigError, lookup, register
+from epo_lightning.registry import ConfigError, check_keys, lookup, register
 
 
 @pytest.fixture(autouse=True)
@@ -69,6 +69,16 @@ def test_unknown_groups_are_refused_where_a_part_is_registered() -> None:
 def test_unknown_parts_are_refused_with_the_place_of_new_ones(group: str, name: str, words: str) -> None:
     with pytest.raises(ConfigError, match=f"unknown {group} '{name}': .*{words}"):
         lookup(group, name)
+
+
+def test_parameters_of_a_part_have_names() -> None:
+    class Own:
+        def __init__(self, *args: float, final: int = 1, **kwargs: float) -> None: ...
+
+    register("forecaster", "own")(Own)
+    said = rf"forecaster 'own' \({__file__}:\d+\) takes \*args.*, but the signature .*: name all its parameters, also those"
+    with pytest.raises(ConfigError, match=said):
+        check_keys("forecaster", {"name": "own", "control_scale": 1.0})
 
 
 def test_an_import_that_fails_is_named_with_its_module() -> None:
