@@ -30,7 +30,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from torch import Tensor
 
@@ -240,7 +240,10 @@ max(0, r_i + r_j + m_ij - |p_i - p_j|), the same with a margin m_ij [m] (``GameP
 BUILT_IN = {*OWN_FEATURES, *PAIR_FEATURES}
 
 
-def _refuse(name: str, source: Source, sources: tuple[Source, ...]) -> None:
+def _refuse(kind: str, name: Any, source: Source, sources: tuple[Source, ...]) -> None:
+    if not isinstance(name, str):
+        own = getattr(name, "__name__", name)
+        raise ConfigError(f'@{kind}_feature needs a name, as text: write @{kind}_feature("{own}") above the function')
     if name in BUILT_IN:
         raise ConfigError(f"{name!r} is a built-in feature; choose another name")
     if not isinstance(source, Source):
@@ -276,10 +279,10 @@ def own_feature(
         channel: ``ACCELERATION`` or ``TURN_RATE``, for signals of controls.
 
     Raises:
-        ConfigError: the name of a built-in feature or of one in another module, or a source that custom functions cannot
-            have.
+        ConfigError: no name, the name of a built-in feature or of one in another module, or a source that custom functions
+            cannot have.
     """
-    _refuse(name, source, (Source.CONTROL, Source.RATE, Source.SPEED, Source.STEP, Source.TRAJECTORY))
+    _refuse("own", name, source, (Source.CONTROL, Source.RATE, Source.SPEED, Source.STEP, Source.TRAJECTORY))
 
     def add(function: Function) -> Function:
         _refuse_another("own", name, OWN_FEATURES.get(name), function)
@@ -308,10 +311,10 @@ def pair_feature(
             of states takes it as its last argument [.., 1].
 
     Raises:
-        ConfigError: the name of a built-in feature or of one in another module, a source that custom functions cannot
-            have, or an unknown need.
+        ConfigError: no name, the name of a built-in feature or of one in another module, a source that custom functions
+            cannot have, or an unknown need.
     """
-    _refuse(name, source, (Source.DISTANCE, Source.STEP, Source.TRAJECTORY))
+    _refuse("pair", name, source, (Source.DISTANCE, Source.STEP, Source.TRAJECTORY))
     if needs is not None and (needs != "size" or source is Source.DISTANCE):
         raise ConfigError(
             f"pair feature {name!r} can need 'size' if it is a function of states (Source.STEP or Source.TRAJECTORY), "

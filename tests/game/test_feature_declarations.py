@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+
 import pytest
 import torch
 from energy_cases import replaced, stacked
@@ -127,3 +129,11 @@ def test_features_of_agents_and_of_pairs_have_different_names(registry):
         ConfigError, match=r"energy\.own and energy\.pair both have a feature called 'mine': rename one"
     ):
         FeatureEnergy(["acc", "mine"], ["mine"])
+
+
+@pytest.mark.parametrize(("register", "kind"), [(own_feature, "own"), (pair_feature, "pair")])
+def test_a_decorator_without_a_name_is_refused(register, kind):
+    with pytest.raises(
+        ConfigError, match=rf'^@{kind}_feature needs a name, .*@{kind}_feature\("wave"\) above the function$'
+    ):
+        inspect.unwrap(register)(wave)  # without the type checker of the tests
