@@ -231,7 +231,7 @@ def manifest(folder: Path, command: str = "", config: Mapping[str, Any] | None =
         CacheError: no data set, an unreadable manifest, one of another format, or of another configuration.
     """
     if not folder.is_dir():
-        hint = f"; make it with `{command}` and all data.* settings and --config-dir of this command" if command else ""
+        hint = f"; make it with `{command}`" if command else ""
         raise CacheError(f"no {folder.name.rpartition('-')[0]} data at {folder}{hint}")
     path = folder / MANIFEST
     try:

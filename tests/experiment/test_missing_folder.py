@@ -62,16 +62,31 @@ def test_without_the_key_the_data_set_is_used_with_a_warning(epo: Epo) -> None:
 
 
 def test_a_run_that_is_scored_from_another_folder_says_where_its_data_are(
-    epo: Epo, refused: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    epo: Epo,
+    refused: Callable[..., str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     with pytest.warns(UserWarning, match="there is no folder data/ucy"):
         assert epo("train", *ROW, *DATA, "run_dir=run") == 0
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
     said = refused("evaluate", f"run={tmp_path / 'run'}")
+    shutil.copytree(tmp_path / "run", tmp_path / "runs" / "first")
+    assert refused("evaluate", f"runs={tmp_path / 'runs'}").startswith("epo: no run in or below")
+    shutil.copytree(tmp_path / "run", tmp_path / "runs" / "second")
+    first = tmp_path / "runs" / "first" / "run.json"
+    first.write_text(first.read_text().replace('"data_digest": "', '"data_digest": "0'))
     assert (
         f"The run is in another folder, {tmp_path / 'run'}, and its data are searched from this one: give the" in said
     )
     monkeypatch.setenv("EPO_CACHE", str(tmp_path / "cache"))
     with pytest.warns(UserWarning, match="there is no folder data/ucy"):
         assert epo("evaluate", f"run={tmp_path / 'run'}") == 0
+    capsys.readouterr()
+    with pytest.warns(UserWarning, match="there is no folder data/ucy"):
+        assert epo("evaluate", f"runs={tmp_path / 'runs'}") == 0, "a run that cannot be scored does not stop the others"
+    printed = capsys.readouterr().out
+    assert f"{tmp_path / 'runs' / 'first'}: left out, " in printed
+    assert f"{tmp_path / 'runs' / 'second'} (test): minADE" in printed
