@@ -210,12 +210,12 @@ def _schema(group: str, name: str) -> Mapping[str, inspect.Parameter]:
     """
     part = lookup(group, name)
     schema = inspect.signature(part).parameters
-    for argument in schema.values():
-        if argument.kind in (argument.VAR_POSITIONAL, argument.VAR_KEYWORD):
-            raise ConfigError(
-                f"{group} {name!r} ({place(part)}) takes {argument}, but the signature of a part is the schema of its "
-                "configuration: name all its parameters, also those that it hands to its base class"
-            )
+    unnamed = [str(one) for one in schema.values() if one.kind in (one.VAR_POSITIONAL, one.VAR_KEYWORD)]
+    if unnamed:
+        raise ConfigError(
+            f"{group} {name!r} ({place(part)}) takes {', '.join(unnamed)}, but the signature of a part is the schema of its "
+            "configuration: name all its parameters, also those that it hands to its base class"
+        )
     return schema
 
 

@@ -76,7 +76,7 @@ def test_parameters_of_a_part_have_names() -> None:
         def __init__(self, *args: float, final: int = 1, **kwargs: float) -> None: ...
 
     register("forecaster", "own")(Own)
-    said = rf"forecaster 'own' \({__file__}:\d+\) takes \*args.*, but the signature .*: name all its parameters, also those"
+    said = rf"forecaster 'own' \({__file__}:\d+\) takes \*args.*, \*\*kwargs.*, but the signature .*: name all its"
     with pytest.raises(ConfigError, match=said):
         check_keys("forecaster", {"name": "own", "control_scale": 1.0})
 
