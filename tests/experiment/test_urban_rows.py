@@ -65,6 +65,7 @@ def content(row: str) -> dict[str, Any]:
     chosen = {"override /task", "override /data"}
     kept = [entry for entry in found["defaults"] if isinstance(entry, str) or not chosen & entry.keys()]
     found["defaults"] = [entry.replace("/urban/", "/highway/") if isinstance(entry, str) else entry for entry in kept]
+    found.pop("task", None)  # of rows without a network, which choose no group of it
     return found
 
 
