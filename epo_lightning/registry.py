@@ -177,13 +177,14 @@ def _home(group: str) -> str:
     return f"{here}, or in a module that an entry point of an installed package names (pip install -e <folder>)"
 
 
-def check_keys(group: str, config: Mapping[str, Any], supplied: Iterable[str] = ()) -> None:
+def check_keys(group: str, config: Mapping[str, Any], supplied: Iterable[str] = (), where: str | None = None) -> None:
     """Compare a part's configuration with its constructor's signature, without building it.
 
     Args:
         group: the group of part, which is also the name of its configuration group.
         config: ``name`` and the part's keyword arguments.
         supplied: arguments that the caller hands over in code and a configuration must not set.
+        where: place of the arguments in the configuration, for messages; by default the group.
 
     Raises:
         ConfigError: a missing ``name``, an unknown part, one whose parameters have no names, an unknown key (with the
@@ -192,31 +193,21 @@ def check_keys(group: str, config: Mapping[str, Any], supplied: Iterable[str] = 
     if not config.get("name"):
         _load(group)
         raise ConfigError(f"{group}.name is missing: {nearest('', _PARTS.get(group, {}))}")
-    schema = _schema(group, config["name"])
-    keys = set(config) - {"name"}
-    known = set(schema) - set(supplied)
-    for key in sorted(keys - known):
-        raise ConfigError(f"unknown key {group}.{key} for {group} {config['name']!r}: {nearest(key, known)}")
-    required = {key for key, argument in schema.items() if argument.default is argument.empty}
-    for key in sorted(required - keys - set(supplied)):
-        raise ConfigError(f"missing key {group}.{key} for {group} {config['name']!r}")
-
-
-def _schema(group: str, name: str) -> Mapping[str, inspect.Parameter]:
-    """The parameters of a part's constructor, all of which have names.
-
-    Raises:
-        ConfigError: no such part, or ``*args`` or ``**kwargs`` among the parameters.
-    """
-    part = lookup(group, name)
+    part, where = lookup(group, config["name"]), where or group
     schema = inspect.signature(part).parameters
     unnamed = [str(one) for one in schema.values() if one.kind in (one.VAR_POSITIONAL, one.VAR_KEYWORD)]
     if unnamed:
         raise ConfigError(
-            f"{group} {name!r} ({place(part)}) takes {', '.join(unnamed)}, but the signature of a part is the schema of its "
-            "configuration: name all its parameters, also those that it hands to its base class"
+            f"{group} {config['name']!r} ({place(part)}) takes {', '.join(unnamed)}, but the signature of a part is the "
+            "schema of its configuration: name all its parameters, also those that it hands to its base class"
         )
-    return schema
+    keys = set(config) - {"name"}
+    known = set(schema) - set(supplied)
+    for key in sorted(keys - known):
+        raise ConfigError(f"unknown key {where}.{key} for {group} {config['name']!r}: {nearest(key, known)}")
+    required = {key for key, argument in schema.items() if argument.default is argument.empty}
+    for key in sorted(required - keys - set(supplied)):
+        raise ConfigError(f"missing key {where}.{key} for {group} {config['name']!r}")
 
 
 def build(group: str, config: Mapping[str, Any], **supplied: Any) -> Any:

@@ -98,7 +98,7 @@ def describe(hint: Any) -> str:
     return str(getattr(base, "__name__", base))
 
 
-def check_part(group: str, values: Any, supplied: Sequence[str] = ()) -> None:
+def check_part(group: str, values: Any, supplied: Sequence[str] = (), where: str | None = None) -> None:
     """Check the section of a part: its keys (:func:`registry.check_keys`), and the types of its values by the constructor.
 
     Raises:
@@ -106,28 +106,15 @@ def check_part(group: str, values: Any, supplied: Sequence[str] = ()) -> None:
     """
     if not isinstance(values, Mapping):
         raise ConfigError(f"{group} must be a mapping with a name, not {values!r}")
-    check_keys(group, values, supplied)
-    check_values(lookup(group, values["name"]), values, group)
-
-
-def check_values(part: Callable[..., Any], values: Mapping[str, Any], where: str) -> None:
-    """Check the types of values by the annotations of the function, or of the constructor, that takes them.
-
-    Args:
-        part: the function or class.
-        values: arguments by name; names without an annotation are not checked.
-        where: place of the values in the configuration, for messages.
-
-    Raises:
-        ConfigError: a value of another type.
-    """
+    check_keys(group, values, supplied, where)
+    part = lookup(group, values["name"])
     try:
         hints = hints_of(part)
     except (NameError, TypeError, SyntaxError):  # annotations of a user's part that exist for type checkers only
         return
     for key, value in values.items():
         if key in hints and not fits(value, hints[key]):
-            raise _unfit(f"{where}.{key}", value, hints[key])
+            raise _unfit(f"{where or group}.{key}", value, hints[key])
 
 
 def hints_of(part: Callable[..., Any]) -> dict[str, Any]:

@@ -26,6 +26,8 @@ from epo_lightning.registry import ConfigError
 from epo_lightning.scene import Scene
 from epo_lightning.task import Task
 
+OF_DATA = ("data=", "data.", "--config-dir=")
+"""Beginnings of the words of a command that choose its data, after a plus."""
 TOGETHER = 64
 """Number of blocks whose scenes are shuffled together."""
 
@@ -199,7 +201,7 @@ class SceneDataModule(LightningDataModule):
         num_agents: number of agents per scene N.
         history: number of observed steps H; None if it is not known before a scene is read.
         order_seed: seed of the order of batches; the data's own seed unless a run sets its own.
-        words: the words of the user's command that choose this data, for error messages.
+        words: the words of the user's command, for error messages.
     """
 
     task: Task
@@ -224,13 +226,20 @@ class SceneDataModule(LightningDataModule):
         """The data set of a split, read from disk."""
         raise NotImplementedError(f"{type(self).__name__} does not define how a split is opened")
 
-    def generation(self, *words: str) -> str:
-        """The command ``epo generate`` with some words, or the user's own for the same keys, and the user's further ones."""
-        known = {
-            word if word.startswith("--") else word.lstrip("+").partition("=")[0]: word
-            for word in (*words, *self.words)
-        }
-        return shlex.join(["epo", "generate", *known.values()])
+    @property
+    def own_words(self) -> list[str]:
+        """Overrides that choose this data set."""
+        return []
+
+    @property
+    def command(self) -> str:
+        """The command that makes this data set, for error messages.
+
+        It has :attr:`own_words`, or the user's for the same keys, and the user's further words about data.
+        """
+        words = (*self.own_words, *(word for word in self.words if word.lstrip("+").startswith(OF_DATA)))
+        by_key = {word if word.startswith("--") else word.lstrip("+").partition("=")[0]: word for word in words}
+        return shlex.join(["epo", "generate", *by_key.values()])
 
     def setup(self, stage: str | None = None) -> None:
         """Open the splits that a stage needs. The test split is read only by the stages ``test`` and ``predict``."""

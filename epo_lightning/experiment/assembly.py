@@ -64,11 +64,6 @@ def describe_model(settings: Settings, data: Any) -> dict[str, Any]:
     return {**sections, "goal": settings.goal, **data.task.to_config()}
 
 
-def words_of_data(overrides: Sequence[str]) -> list[str]:
-    """The words of a command that choose its data: overrides of ``data``, and folders of configurations."""
-    return [word for word in overrides if word.lstrip("+").startswith(("data=", "data.", "--config-dir="))]
-
-
 def refuse_missing_folder(data: Any, given: Collection[str]) -> None:
     """Refuse a folder of recordings that the user has named and that does not exist, because a misspelt name would have the
     same effect as no folder: the cache would be searched for a data set of these settings.
@@ -92,7 +87,7 @@ def refuse_unread_bounds(energy: Mapping[str, Any], given: Collection[str]) -> N
 
     Args:
         energy: the section of the energy.
-        given: keys that the user has set.
+        given: keys of bounds that the user has set.
 
     Raises:
         ConfigError: a bound without effect.
@@ -121,7 +116,8 @@ def build(settings: Settings, overrides: Sequence[str] = ()) -> tuple[Any, Forec
         mlflow.check_settings(settings.logger.mlflow)
     data = build_data(settings.data)
     refuse_missing_folder(data, keys_of(overrides))
-    refuse_unread_bounds(settings.energy, keys_of(overrides))
+    if bounds := {key for key in keys_of(overrides) if key.startswith("energy.bounds.")}:
+        refuse_unread_bounds(settings.energy, bounds)
     # The order of the batches belongs to the run; data.seed draws the scenes and splits.
     data.order_seed = settings.seed
     check_divisible(getattr(data, "batch_size", settings.trainer.devices), settings.trainer.devices)

@@ -48,7 +48,7 @@ def open_data(run: RunFolder, settings: Settings, batch_size: int | None = None)
     if batch_size is not None and "batch_size" in section:
         section["batch_size"] = batch_size
     data = assembly.build_data(section)
-    data.words = assembly.words_of_data(shlex.split(str(run.record.get("command", ""))))
+    data.words = shlex.split(str(run.record.get("command", "")))
     try:
         data.setup("test")
     except ConfigError as error:

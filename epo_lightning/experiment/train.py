@@ -70,7 +70,7 @@ def train(config: dict[str, Any], overrides: Sequence[str] = (), begun: RunFolde
     if begun is None:
         refuse_occupied(settings, run, data.digest)
     if not run.finished:
-        data.words = assembly.words_of_data(overrides)
+        data.words = overrides
         data.setup("fit")  # raises an error for missing data before a run folder is made
     # In a sweep, another process may be training this run: wait until it has finished. Otherwise wait two seconds.
     patience = None if settings.sweep and begun is None else 2.0

@@ -56,14 +56,14 @@ def check_settings(verb: str, config: dict[str, Any]) -> Any:
 def generate_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None:
     """Make the data set unless it exists, and print its report and a command that trains on it."""
     settings = check_settings("generate", config)
-    from epo_lightning.experiment import assembly
+    from epo_lightning.data.datamodule import OF_DATA
     from epo_lightning.experiment.config.compose import tree
     from epo_lightning.experiment.config.sources import HIGHWAYS
 
     data = make_data(settings, overrides)
     dataset = settings.data.get("dataset", "rpi")
     row = f"{dataset}/v_lstm_epo" + ("_relaxed" if dataset == "rpi" else "")
-    kept = assembly.words_of_data(overrides)
+    kept = [word for word in overrides if word.lstrip("+").startswith(OF_DATA)]
     vehicles = dataset in HIGHWAYS
     if (vehicles and data.task.map) or (tree() / "conf" / "experiment" / f"{row}.yaml").is_file():
         words = [f"experiment={row}", *(word for word in kept if word != f"data={dataset}")]

@@ -26,6 +26,7 @@ EXAMPLES = {
     "imitation_speed",
     "test_imitation_speed",
     "fixed_step",
+    "heading",
 }
 """Files that the pages tell a reader to write."""
 

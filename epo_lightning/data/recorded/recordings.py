@@ -269,12 +269,12 @@ class RecordedData(SceneDataModule):
         return any(self._digest(config) == digest for config in of_older_versions(self.config))
 
     @property
-    def command(self) -> str:
-        """The command that makes this data set, for error messages."""
+    def own_words(self) -> list[str]:
+        """Overrides that choose this data set."""
         words = [f"data={self.dataset_name}", f"data.folder={self.folder_of_recordings}"]
         if self.root != cache.default_root():
             words.append(f"data.root={self.root}")
-        return self.generation(*words)
+        return words
 
     def generate(
         self, workers: int | None = None, progress: bool = True, strict: bool = False, launch: Launch | None = None

@@ -21,8 +21,8 @@ from typing import Any
 
 from epo_lightning.data import cache
 from epo_lightning.data.recorded.tracks import Recording, RecordingSource
-from epo_lightning.registry import ConfigError, lookup, nearest, place
-from epo_lightning.schema import check_values
+from epo_lightning.registry import ConfigError, lookup, place
+from epo_lightning.schema import check_part
 
 PIECE, PIECES = 1 << 14, 64
 """Size [bytes] and number of the pieces of a file that enter its checksum; files up to 1 MB are covered completely."""
@@ -77,11 +77,8 @@ def with_options(format: str, options: Mapping[str, Any]) -> Callable[[Path], li
         ConfigError: an unknown format, an option that it does not have, or a value of another type than the option's.
     """
     list_sources = lookup("format", format)
-    known = list(inspect.signature(list_sources).parameters)[1:]
-    for name in options:
-        if name not in known:
-            raise ConfigError(f"unknown key data.options.{name} for format {format!r}: {nearest(name, known)}")
-    check_values(list_sources, options, "data.options")
+    folder = next(iter(inspect.signature(list_sources).parameters))
+    check_part("format", {"name": format, **options}, [folder], "data.options")
     return partial(list_sources, **options)
 
 

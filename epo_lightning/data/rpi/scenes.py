@@ -170,8 +170,8 @@ class RPIData(SceneDataModule):
         return cache.digest({"set": self.config, "targets": self.targets, **few})[:16]
 
     @property
-    def command(self) -> str:
-        """The command that makes this data set, for error messages."""
+    def own_words(self) -> list[str]:
+        """Overrides that choose this data set."""
         defaults = {
             "recipe": RECIPE,
             "seed": 0,
@@ -187,7 +187,7 @@ class RPIData(SceneDataModule):
             words.append("data.sizes=" + ("null" if self.sizes is None else "[" + ",".join(map(str, self.sizes)) + "]"))
         if self.root != cache.default_root():
             words.append(f"data.root={self.root}")
-        return self.generation("data=rpi", *words)
+        return ["data=rpi", *words]
 
     def generate(self, workers: int | None = None, progress: bool = True) -> Path:
         """Make the data set unless it exists already, and return its folder.

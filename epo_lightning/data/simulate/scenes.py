@@ -80,8 +80,8 @@ class SimulatedHighway(RecordedData):
         return self._config_of(sources, self.identity(sources))
 
     @property
-    def command(self) -> str:
-        """The command that makes this data set, for error messages."""
+    def own_words(self) -> list[str]:
+        """Overrides that choose this data set."""
         defaults = {"recordings": 3, "minutes": 9.0, "layouts": [layout.id for layout in simulate.LAYOUTS], "seed": 0}
         words = [f"data={self.dataset_name}"]
         for name, value in defaults.items():
@@ -91,7 +91,7 @@ class SimulatedHighway(RecordedData):
             words.append(f"++data.traffic={self.traffic}")  # whether or not its file has this setting
         if self.root != cache.default_root():
             words.append(f"data.root={self.root}")
-        return self.generation(*words)
+        return words
 
     def recordings(self) -> list[RecordingSource]:
         """The simulated recordings, listed by the reader of exiD's format."""

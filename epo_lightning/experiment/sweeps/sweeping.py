@@ -213,7 +213,7 @@ def _listed(sweep: Sweep, words: Sequence[str], extra: Sequence[str], choices: C
         data = json.dumps(config["data"], sort_keys=True)
         if data not in ready and sweep.state(job) != "done":
             module = assembly.build_data(config["data"])
-            module.words = assembly.words_of_data([*overrides, *(f"--config-dir={folder}" for folder in extra)])
+            module.words = [*overrides, *(f"--config-dir={folder}" for folder in extra)]
             module.setup("fit")
             ready.add(data)
         if {*job.measures} - {"time"} and config["forecaster"]["name"] != UNLEARNED:
