@@ -57,10 +57,10 @@ class GameParameters(Batch):
         for field in dataclasses.fields(self):
             value, name = getattr(self, field.name), f"parameters.{field.name}"
             if field.name in ("own_weights", "pair_weights", "margins"):
-                if not isinstance(value, Mapping):
-                    raise TypeError(
-                        f"{name} is a {type(value).__name__}; it takes a tensor for each feature, {{name: tensor}}"
-                    )
+                if not hasattr(value, "items"):
+                    raise TypeError(f"{name} is a {type(value).__name__}; it takes a tensor for each feature")
+                if not isinstance(value, Mapping):  # such as a ParameterDict of PyTorch
+                    object.__setattr__(self, field.name, dict(value.items()))
                 for feature, tensor in value.items():
                     _check_tensor(f"{name}[{feature!r}]", tensor)
             elif value is not None or field.default is dataclasses.MISSING:

@@ -69,10 +69,13 @@ def register(group: str, name: str) -> Callable[[Part], Part]:
     A part that is defined again, as by a cell of a notebook that runs twice, replaces the one before.
 
     Raises:
-        ConfigError: an unknown group, or a name that another part of the group has.
+        ConfigError: an unknown group, a name that is no text, or one that another part of the group has.
     """
     if group not in _HOMES:
         raise ConfigError(f"@register({group!r}, {name!r}): unknown group of parts {group!r}: {nearest(group, _HOMES)}")
+
+    if not isinstance(name, str) or not name:
+        raise ConfigError(f"@register({group!r}, {name!r}): the name of a part must be a text that is not empty")
 
     def add(part: Part) -> Part:
         known = _PARTS.setdefault(group, {})

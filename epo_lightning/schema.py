@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
@@ -70,6 +71,9 @@ def fits(value: Any, hint: Any) -> bool:
     if isinstance(base, type) and issubclass(base, Mapping):
         entry = arguments[1] if len(arguments) == 2 else Any
         return isinstance(value, Mapping) and all(fits(item, entry) for item in value.values())
+    if base is tuple and arguments and arguments[-1] is not Ellipsis:
+        many = isinstance(value, list | tuple) and len(value) == len(arguments)
+        return many and all(map(fits, value, arguments))
     if isinstance(base, type) and issubclass(base, Sequence):
         entry = arguments[0] if arguments else Any
         return isinstance(value, Sequence) and not isinstance(value, str) and all(fits(item, entry) for item in value)
@@ -112,8 +116,9 @@ def check_part(group: str, values: Any, supplied: Sequence[str] = (), where: str
         hints = hints_of(part)
     except (NameError, TypeError, SyntaxError):  # annotations of a user's part that exist for type checkers only
         return
+    defaults = {name: argument.default for name, argument in inspect.signature(part).parameters.items()}
     for key, value in values.items():
-        if key in hints and not fits(value, hints[key]):
+        if key in hints and not fits(value, hints[key]) and not (value is None and defaults.get(key, 0) is None):
             raise _unfit(f"{where or group}.{key}", value, hints[key])
 
 

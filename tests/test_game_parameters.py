@@ -48,6 +48,16 @@ def test_values_that_are_no_tensors_are_named(field: str, value: Any, message: s
         GameParameters(**{**right, field: value})
 
 
+def test_learned_weights_in_a_dictionary_of_parameters_are_taken() -> None:
+    weights = torch.nn.ParameterDict({"acc": torch.ones(1, 2, 2), "turnr": torch.ones(1, 2, 2)})
+    scene = random_scene(1, 2, horizon=3)
+    game = GameParameters(weights, {}, torch.randn(1, 2, 2, 3, 2))  # type: ignore[arg-type]
+    solution = LevenbergMarquardt()(FeatureEnergy(["acc", "turnr"], pair=[]), scene, game)
+    solution.controls.square().sum().backward()
+    assert all((weight.grad != 0).all() for weight in weights.values())
+    assert game.to(torch.float64).own_weights["acc"].dtype == torch.float64
+
+
 def test_a_solver_names_arguments_in_another_order() -> None:
     scene, energy = random_scene(1, 2), FeatureEnergy(["acc"])
     game, solve = random_game(scene, own=("acc",)), LevenbergMarquardt()

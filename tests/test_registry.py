@@ -48,6 +48,12 @@ def test_a_part_that_is_defined_again_replaces_the_one_before() -> None:
     assert again() is lookup("backbone", "mine")
 
 
+@pytest.mark.parametrize("name", ["", 3, None])
+def test_names_are_texts(name: object) -> None:
+    with pytest.raises(ConfigError, match="the name of a part must be a text that is not empty"):
+        register("metric", name)  # type: ignore[arg-type]
+
+
 def test_unknown_groups_are_refused_where_a_part_is_registered() -> None:
     with pytest.raises(ConfigError, match=r"@register\('backbones', 'gru'\): .*did you mean 'backbone'"):
         register("backbones", "gru")

@@ -237,7 +237,8 @@ class SceneDataModule(LightningDataModule):
 
         It has :attr:`own_words`, or the user's for the same keys, and the user's further words about data.
         """
-        words = (*self.own_words, *(word for word in self.words if word.lstrip("+").startswith(OF_DATA)))
+        given = (word for word in self.words if word.lstrip("+").startswith(OF_DATA) and "${" not in word)
+        words = (*self.own_words, *given)
         by_key = {word if word.startswith("--") else word.lstrip("+").partition("=")[0]: word for word in words}
         return shlex.join(["epo", "generate", *by_key.values()])
 

@@ -26,7 +26,7 @@ from epo_lightning.experiment.truth import TruthTest
 from epo_lightning.files import read_json, write_json
 from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.registry import ConfigError
-from epo_lightning.report.columns import TRUE
+from epo_lightning.report.columns import TRUE, is_own
 from epo_lightning.run_folder import OTHER, RunFolder, discover, numbered
 from epo_lightning.schema import read
 
@@ -65,6 +65,8 @@ def evaluate(config: dict[str, Any], overrides: Sequence[str] = ()) -> list[tupl
                 raise
             refused.append(error)
             print(f"{run.path}: left out, {error}")
+    if refused and scored:
+        print(f"{len(refused)} of {len(refused) + len(scored)} runs left out")
     if refused and not scored:
         where = "" if settings.data is None else " on this data"
         raise ConfigError(f"no run in or below {settings.runs} can be scored{where}: {refused[0]}")
@@ -211,6 +213,7 @@ def keep(run: RunFolder, scored: dict[str, Any], checkpoint: Path) -> Path:
 
     The scores of the best checkpoint are ``metrics.json`` (``metrics-val.json`` on the validation split). If that file holds
     the same scores already it stays as it is; if they lack scores that older versions did not compute, these are added.
+    Registered metrics are replaced.
     Scores of another checkpoint, and scores that differ from those in the file, go to
     ``scores-<split>-<checkpoint>-<digest>.json``, which records the digest of the checkpoint as well as of the data. If that
     file holds others, the name gets a number.
@@ -221,11 +224,7 @@ def keep(run: RunFolder, scored: dict[str, Any], checkpoint: Path) -> Path:
             write_json(file, scored)
         stored = read_json(file)
         if _same(stored, scored):
-            completed = {**scored, **stored}
-            for section in (name for name in SECTIONS if name in completed):
-                completed[section] = {**scored.get(section, {}), **stored.get(section, {})}
-            if completed != stored:
-                write_json(file, completed)
+            _complete(file, scored)
             return file
     digest = file_digest(checkpoint)[:16]
     stem = f"scores-{scored['split']}-{Path(scored['checkpoint']).stem}-{digest[:8]}"
@@ -262,8 +261,20 @@ def _beside(run: RunFolder, stem: str, scored: dict[str, Any], keys: Sequence[st
             write_json(file, scored)
             return file
         if _same(read_json(file), scored, keys):
+            _complete(file, scored)
             return file
     raise AssertionError("unreachable")
+
+
+def _complete(file: Path, scored: Mapping[str, Any]) -> None:
+    """Add scores that a file lacks; registered metrics get their new values, because their code is the user's."""
+    stored = read_json(file)
+    completed: dict[str, Any] = {**scored, **stored}
+    for section in (name for name in SECTIONS if name in completed):
+        own = {name: value for name, value in scored.get(section, {}).items() if is_own(name)}
+        completed[section] = {**scored.get(section, {}), **stored.get(section, {}), **own}
+    if completed != stored:
+        write_json(file, completed)
 
 
 def _readable(file: Path) -> bool:
@@ -281,13 +292,17 @@ def _readable(file: Path) -> bool:
 def _same(
     stored: dict[str, Any], scored: dict[str, Any], keys: Sequence[str] = ("split", "data_digest", "checkpoint")
 ) -> bool:
-    """Whether new scores are of the same data and checkpoint as stored ones, and equal them up to the last digits."""
+    """Whether new scores are of the same data and checkpoint as stored ones, and equal them up to the last digits.
+
+    Registered metrics are not compared.
+    """
     if any(stored.get(key) != scored[key] for key in keys):
         return False
     pairs = [
         (value, scored.get(section, {}).get(name, math.inf))
         for section in SECTIONS
         for name, value in stored.get(section, {}).items()
+        if not is_own(name)
     ]
     return all(
         math.isclose(one, other, rel_tol=TOLERANCE, abs_tol=1e-9) or (math.isnan(one) and math.isnan(other))

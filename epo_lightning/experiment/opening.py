@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import shlex
 from pathlib import Path
 from typing import Any
@@ -48,7 +49,8 @@ def open_data(run: RunFolder, settings: Settings, batch_size: int | None = None)
     if batch_size is not None and "batch_size" in section:
         section["batch_size"] = batch_size
     data = assembly.build_data(section)
-    data.words = shlex.split(str(run.record.get("command", "")))
+    with contextlib.suppress(ValueError):  # a command with a quotation mark too few, edited by hand
+        data.words = shlex.split(str(run.record.get("command", "")))
     try:
         data.setup("test")
     except ConfigError as error:

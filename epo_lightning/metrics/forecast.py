@@ -231,12 +231,12 @@ def own_values(forecast: JointForecast, scene: Scene) -> dict[str, Float[Tensor,
             where = failing_place(error, metric)
             raise ConfigError(f"the metric {name!r} fails at {where}, {type(error).__name__}: {error}") from error
         shape = list(value.shape) if isinstance(value, Tensor) else type(value).__name__
-        if shape != [len(scene.history)]:
+        if shape != [len(scene.history)] or value.is_complex():
             raise ConfigError(
                 f"{place(metric)}: the metric {name!r} returned {shape}; a tensor [{len(scene.history)}] was expected, a "
-                "number for every scene"
+                "real number for every scene"
             )
-        values[OWN + name] = value
+        values[OWN + name] = value.detach().to(scene.history.device)
     return values
 
 

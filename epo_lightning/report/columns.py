@@ -27,7 +27,7 @@ class Column:
         """Whether rows are ranked by it; energies and their gradients and gaps have different units in each row, the
         effect of pair terms is neither good nor bad, of a correlation with the truth more is better, and of a registered
         metric it is not known."""
-        return not (self.metric in OWN_UNITS or self.is_effect or self.metric.startswith(TRUE) or OWN in self.metric)
+        return not (self.metric in OWN_UNITS or self.is_effect or self.metric.startswith(TRUE) or is_own(self.metric))
 
     @property
     def is_effect(self) -> bool:
@@ -107,8 +107,14 @@ STOPPED = "stopped"
 TRUE = "true_"
 """Beginning of the names of metrics that compare inferred costs with the true ones."""
 
-OWN = "own/"
-"""Beginning of the names of metrics that users have registered."""
+OWN = "own"
+"""Beginning of the names of metrics that users have registered: ``own/jerk``, of a subset ``executed/own/jerk``."""
+
+
+def is_own(metric: str) -> bool:
+    """Whether a user has registered the metric."""
+    return OWN in metric.split("/")[:-1]
+
 
 TRUTH = (
     Column(f"{TRUE}pair_rank", "w: rank correlation"),

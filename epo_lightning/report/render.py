@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from epo_lightning.report.columns import GAME, MISSING, OF_MODES, OWN, TRUE, Column, decimals, number
+from epo_lightning.report.columns import GAME, MISSING, OF_MODES, TRUE, Column, decimals, is_own, number
 from epo_lightning.report.rows import Cell, Row
 from epo_lightning.report.selection import BestSetting
 from epo_lightning.report.statistics import Comparisons, Difference
@@ -142,7 +142,7 @@ def legend(
     few = "; with k, over the k most likely" if any(map(OF_MODES.fullmatch, metrics)) else ""
     errors = any(
         not (metric in GAME or Column(metric, "").is_effect or metric.startswith(TRUE))
-        and not ("overlap" in metric or OWN in metric)
+        and not ("overlap" in metric or is_own(metric))
         for metric in metrics
     )
     mean = "Mean ± sample standard deviation over n seeds" if any(cell.deviation is not None for cell in cells) else ""

@@ -13,7 +13,7 @@ from typing import Any
 
 from epo_lightning.identity import differences
 from epo_lightning.registry import ConfigError
-from epo_lightning.report.columns import GAME
+from epo_lightning.report.columns import GAME, is_own
 from epo_lightning.report.labels import labels, value_text, varying
 from epo_lightning.report.paper import interacts, is_papers, paper_values
 from epo_lightning.report.runs import EvaluatedRun
@@ -273,7 +273,10 @@ def _row(runs: Sequence[EvaluatedRun]) -> Row:
                 f"row {run.name!r} has seed {run.seed} twice, {twin.path} and {run.path} are the same run: "
                 "move one of them away"
             )
-        for metric in ({*first.metrics} ^ {*run.metrics}) - {*GAME}:  # metrics of the game may be missing in some runs
+        # Metrics of the game, and those of users, may be missing in some runs.
+        for metric in sorted(
+            name for name in {*first.metrics} ^ {*run.metrics} if name not in GAME and not is_own(name)
+        ):
             one, other = (first, run) if metric in first.metrics else (run, first)
             raise ConfigError(
                 f"row {run.name!r}: {one.path} was scored by {metric} and {other.path} was not: "
@@ -285,7 +288,8 @@ def _row(runs: Sequence[EvaluatedRun]) -> Row:
     paper = paper_values(*known) if in_paper else {}
     cells = {}
     for metric in dict.fromkeys(metric for run in runs for metric in run.metrics):
-        values = [run.metrics.get(metric, math.nan) for run in runs]
+        scored = [run for run in runs if metric in run.metrics] if is_own(metric) else runs
+        values = [run.metrics.get(metric, math.nan) for run in scored]
         constant = not first.learned and len({*values}) == 1
         sampled = len(values) > 1 and all(map(math.isfinite, values)) and not constant
         deviation = statistics.stdev(values) if sampled else None

@@ -275,6 +275,10 @@ def test_the_command_that_makes_a_data_set_has_the_words_of_the_users_command():
     data.words = ["data=own", "+data.split=hard", "data.batch_size=8", "--config-dir=a", "--config-dir=b"]
     own = "data=own data.recipe=1 +data.split=hard data.batch_size=8 --config-dir=a --config-dir=b"
     assert data.command == f"epo generate {own}"
+    data.words = ["seed=3", "data.seed=${seed}"]
+    assert data.command == "epo generate data=rpi data.recipe=1 data.split=hard", (
+        "a reference is no word of this command"
+    )
 
 
 def test_the_digest_follows_what_a_run_depends_on(tmp_path):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -42,3 +44,31 @@ def test_older_runs_get_the_metric_when_they_are_evaluated_again(
     assert "| top speed |" in after
     assert "| Constant velocity |" in after
     assert "own and" not in (tmp_path / "after" / "results.md").read_text(), "no subset of scenes has this name"
+
+
+def test_metrics_that_some_runs_lack_and_corrected_ones_do_not_prevent_a_report(
+    epo: Epo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A metric has no value for the scenes of one seed, has another name later, or another formula."""
+
+    def own(**metrics: Callable[[JointForecast, Scene], Tensor]) -> None:
+        monkeypatch.setattr(registry, "_PARTS", {**registry._PARTS, "metric": metrics})
+
+    def stored(seed: int) -> dict[str, float]:
+        found = json.loads((tmp_path / "runs" / f"s{seed}" / "metrics.json").read_text())["metrics"]
+        return {name: value for name, value in found.items() if name.startswith("own/")}
+
+    words = ("experiment=rpi/v_lstm_sc", "data=drawn", "budget=smoke", "callbacks.progress=none", "score=test")
+    for seed in (0, 1):
+        own(**({"speed": top_speed} if seed else {"other": top_speed}))
+        assert epo("train", *words, f"seed={seed}", f"run_dir=runs/s{seed}") == 0
+    assert epo("report", "runs=runs", "out=first") == 0
+    own(speed=lambda forecast, scene: 2 * top_speed(forecast, scene))
+    before = stored(1)["own/speed"]
+    assert epo("evaluate", "runs=runs") == 0
+    assert stored(0).keys() == {"own/other", "own/speed"}
+    assert stored(1) == {"own/speed": pytest.approx(2 * before)}
+    assert not list(tmp_path.rglob("scores-*.json"))
+    assert epo("report", "runs=runs", "out=second") == 0
+    mean = (stored(0)["own/speed"] + stored(1)["own/speed"]) / 2
+    assert f"{mean:.3f}" in table_of(tmp_path / "second")

@@ -59,7 +59,11 @@ def test_values_are_means_over_scenes_and_subsets_without_nan(add: Callable[[str
         ),
         (
             lambda forecast, scene: 1.0,
-            r"the metric 'mine' returned float; a tensor \[4\] was expected, a number for every",
+            r"the metric 'mine' returned float; a tensor \[4\] was expected, a real number for every",
+        ),
+        (
+            lambda forecast, scene: torch.ones(4) * 1j,
+            r"the metric 'mine' returned \[4\]; .*, a real number for every",
         ),
         (
             lambda forecast, scene: forecast.speeds,

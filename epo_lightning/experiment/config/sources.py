@@ -6,6 +6,7 @@ import pickle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import yaml
 from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra.core.object_type import ObjectType
 from hydra.plugins.config_source import ConfigLoadError, ConfigResult
@@ -71,11 +72,16 @@ def _check_colons(file: Path, config: Container) -> None:
         ConfigError: the file, and what to write.
     """
     values: Any = OmegaConf.to_container(config, resolve=False)
-    for key, value in leaves(values) if isinstance(values, dict) else ():
-        place, blank, given = key.partition(" ")
-        if blank and value is None:
-            name = place.rpartition(".")[2]
-            raise ConfigError(f"in {file}, `{name} {given}` lacks a colon: write `{name}: {given}`")
+    if not isinstance(values, dict) or not any(" " in key and value is None for key, value in leaves(values)):
+        return
+    nodes = [yaml.compose(file.read_text(encoding="utf-8"))]  # in which an empty value is not the word null
+    while nodes:
+        node = nodes.pop()
+        for key, value in node.value if isinstance(node, yaml.MappingNode) else ():
+            nodes.append(value)
+            name, blank, given = str(key.value).partition(" ")
+            if blank and key.style is None and value.value == "" and value.style is None:
+                raise ConfigError(f"in {file}, `{name} {given}` lacks a colon: write `{name}: {given}`")
 
 
 class TreeSource(ParsedOnce):

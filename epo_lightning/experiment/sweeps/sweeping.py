@@ -220,7 +220,7 @@ def _listed(sweep: Sweep, words: Sequence[str], extra: Sequence[str], choices: C
             scored.setdefault(job.data + fold(config), []).append(config)
         jobs.setdefault(job.run.path, job)
         twin = same.setdefault(job.identity, job)
-        if twin.run.path != job.run.path:
+        if (twin.run.path, twin.title) != (job.run.path, job.title):
             raise ConfigError(
                 f"the rows {twin.title!r} and {job.title!r} have the same settings, so that {twin.run.path} and "
                 f"{job.run.path} would be the same run: change a setting of one row, or leave the row out"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
@@ -263,12 +263,14 @@ def test_rows_with_the_same_settings_are_refused(tmp_path: Path) -> None:
     for name, damping in (("usual", 10.0), ("less", 5.0)):
         (own / f"{name}.yaml").write_text(row.format(name, damping))
 
-    def listed(*experiments: str) -> int:
+    def listed(*experiments: str, more: Sequence[str] = ()) -> int:
         words = [f"experiment={','.join(experiments)}", "seed=0,1", "data=drawn", "data.like=rpi", "budget=smoke"]
         sweep = Sweep(tmp_path / "runs" / "sweeps" / "a")
-        return len(_listed(sweep, ["sweeps=rpi_main", "score=val", *words], [str(own.parent)]))
+        return len(_listed(sweep, ["sweeps=rpi_main", "score=val", *words, *more], [str(own.parent)]))
 
     assert listed("rpi/v_lstm_epo", "less") == 4
+    with pytest.raises(ConfigError, match=r"the rows 'a' and 'b' have the same settings, .* would be the same run"):
+        listed("less", more=["title=a,b"])
     with pytest.raises(ConfigError, match=r"the rows 'V-LSTM \+ EPO' and 'usual' have the same settings, .* same run"):
         listed("rpi/v_lstm_epo", "usual")
 
