@@ -25,6 +25,7 @@ from epo_lightning.experiment.config.settings import (
 )
 from epo_lightning.files import read_json
 from epo_lightning.registry import ConfigError
+from epo_lightning.report.columns import is_own
 from epo_lightning.report.labels import word
 from epo_lightning.run_folder import RunFolder
 from epo_lightning.schema import check_part, read
@@ -172,7 +173,7 @@ def _print_trained(run: RunFolder) -> float | None:
 
 def _headline(metrics: Mapping[str, float]) -> str:
     """The most important scores, and those of registered metrics, in one line."""
-    own = [name for name in metrics if name.startswith("own/")]
+    own = [name for name in metrics if is_own(name)]
     return ", ".join(f"{name} {metrics[name]:.4f}" for name in (*HEADLINE, *own) if name in metrics)
 
 
