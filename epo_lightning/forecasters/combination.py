@@ -129,7 +129,7 @@ def _or(what: Iterable[str]) -> str:
 
 
 def _nothing() -> str:
-    """What a solver of one's own provides if it declares nothing, and what the declarations are for."""
+    """Text for a solver that declares nothing in ``provides``: the declarations that derivatives need."""
     needs = {name: getattr(part, "needs_from_solver", ()) for name, part in parts("backward").items()}
     uses = [
         f"{' or '.join(sorted(map(str.upper, words)))} for backward={name}" for name, words in needs.items() if words

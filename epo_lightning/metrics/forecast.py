@@ -65,8 +65,11 @@ def columns() -> tuple[str, ...]:
 
 
 def scores() -> tuple[str, ...]:
-    """Names of all scores; ``ECE`` is the calibration error of the probabilities of several modes
-    (:mod:`~epo_lightning.metrics.functional.calibration`)."""
+    """Names of all scores.
+
+    ``ECE`` is the calibration error of the probabilities of several modes
+    (:mod:`~epo_lightning.metrics.functional.calibration`).
+    """
     return (*columns(), "ECE")
 
 

@@ -111,10 +111,10 @@ def listed(
 
 
 def _checked(returned: Any, format: str) -> list[RecordingSource]:
-    """What the function of a format returned, if it is recordings.
+    """Recordings that the function of a format returned.
 
     Raises:
-        ConfigError: it is something else; the message names the function's file.
+        ConfigError: it returned something else; the message names its file.
     """
     what = "None" if returned is None else type(returned).__name__
     if isinstance(returned, Iterable):
