@@ -53,6 +53,11 @@ class Task:
                 raise ConfigError(f"a task's {name} must be positive and finite, not {getattr(self, name)}")
         if self.shape not in SHAPES:
             raise ConfigError(f"a task's shape must be {' or '.join(SHAPES)}, not {self.shape!r}")
+        if taken := {"initial", "own"} & {*self.subsets}:
+            raise ConfigError(
+                f"a task has a subset {min(taken)!r}, but scores such as initial/minSADE and own/<metric> have this "
+                "beginning: choose another name"
+            )
 
     @classmethod
     def from_config(cls, model: Mapping[str, Any]) -> Task:

@@ -279,7 +279,8 @@ def build_trainer(
             logger=list(loggers),
             enable_progress_bar=any(isinstance(callback, TQDMProgressBar) for callback in callbacks),
             enable_model_summary=False,
-            num_sanity_val_steps=0,
+            # One batch is validated before the first step, so that a metric that fails is found at once.
+            num_sanity_val_steps=1,
             inference_mode=False,  # the layer differentiates its energy also when it only forecasts
         )
 

@@ -78,14 +78,19 @@ def _chosen(settings: EvaluateSettings) -> list[RunFolder]:
         return [RunFolder.open(settings.run)]
     folder = Path(str(settings.runs)).expanduser()
     found = list(discover(folder))
-    finished = [run for run in found if run.finished]
-    if not finished:
-        raise ConfigError(f"no finished run in or below {folder} ({len(found)} unfinished): train one with `epo train`")
+    finished = []
     for run in found:
-        if run not in finished:
+        try:
+            if run.finished:
+                finished.append(run)
+                continue
             failed = run.state == "failed"
             why = f"failed: {run.record['error']}" if failed else f"not finished (`epo train resume={run.path}`)"
-            print(f"{run.path}: left out, {why}")
+        except ConfigError as damaged:
+            why = str(damaged)
+        print(f"{run.path}: left out, {why}")
+    if not finished:
+        raise ConfigError(f"no finished run in or below {folder} ({len(found)} others): train one with `epo train`")
     return finished
 
 

@@ -179,7 +179,7 @@ def _runtimes(timings: Sequence[Timing]) -> Iterable[Chart]:
     found = [(where, same) for where, same in found if len({(t.agents, t.steps, t.modes) for t in same}) > 1]
     for number, (where, members) in enumerate(found, 1):
         suffix = f"_{number}" if len(found) > 1 else ""
-        header = ("N", "S", "M", "mean", "median", "10% to 90%", "samples", "run")
+        header = ("N", "S", "M", "mean", "median", "10 % to 90 %", "forecasts", "run")
         numbers = tuple(_timing_numbers(timing) for timing in sorted(members, key=_position))
         modes, seconds = grid(members)
         if len(seconds) > 1:

@@ -45,7 +45,7 @@ def test_best_responses_come_close_to_the_central_solution(capsys, tmp_path):
 
 @pytest.mark.slow
 def test_forecasts_of_traffic_are_made_faster_and_slower(capsys, tmp_path):
-    pytest.importorskip("libsumo", reason="the extra `sim` is not installed")
+    pytest.importorskip("libsumo", reason="SUMO cannot be loaded", exc_type=ImportError)
     forecast_speed.main(["highway_sim/hivt_m_epo", "--traffic", "free", "--episodes", "1", "--watched", "1"])
     rows = [line.split("  ")[0] for line in capsys.readouterr().out.splitlines()]
     assert [rows.count(name) for name in ("HiVT-M + EPO", "keeping their speed")] == [3, 3]

@@ -21,7 +21,7 @@ from epo_lightning.drive.traffic import TrafficWorld
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import Scene
 
-pytest.importorskip("libsumo", reason="the extra `sim` is not installed")
+pytest.importorskip("libsumo", reason="SUMO cannot be loaded", exc_type=ImportError)
 
 from epo_lightning.drive.sumo import SumoSimulation, SumoSimulator, lanes_of, sumo_world
 from epo_lightning.drive.sumo_process import END, Branch, Vehicles, _closed, _episode, _Road, _stream

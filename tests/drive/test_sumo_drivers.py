@@ -13,7 +13,7 @@ import pytest
 from epo_lightning.data.simulate.demand import STYLES
 from epo_lightning.data.simulate.traffic import Simulation
 
-pytest.importorskip("libsumo", reason="the extra `sim` is not installed")
+pytest.importorskip("libsumo", reason="SUMO cannot be loaded", exc_type=ImportError)
 
 from epo_lightning.drive.sumo import SumoSimulator
 from epo_lightning.drive.sumo_process import END, OWN, Vehicles, _episode, _Hesitation, _stream

@@ -81,6 +81,8 @@ def test_a_run_that_is_scored_from_another_folder_says_where_its_data_are(
     assert (
         f"The run is in another folder, {tmp_path / 'run'}, and its data are searched from this one: give the" in said
     )
+    shutil.copytree(tmp_path / "run", tmp_path / "runs" / "third")
+    (tmp_path / "runs" / "third" / "run.json").write_text('{"status": "fin')
     monkeypatch.setenv("EPO_CACHE", str(tmp_path / "cache"))
     with pytest.warns(UserWarning, match="there is no folder data/ucy"):
         assert epo("evaluate", f"run={tmp_path / 'run'}") == 0
@@ -90,3 +92,5 @@ def test_a_run_that_is_scored_from_another_folder_says_where_its_data_are(
     printed = capsys.readouterr().out
     assert f"{tmp_path / 'runs' / 'first'}: left out, " in printed
     assert f"{tmp_path / 'runs' / 'second'} (test): minADE" in printed
+    assert f"{tmp_path / 'runs' / 'third'}: left out, " in printed
+    assert "run.json" in printed.partition("third: left out, ")[2].partition("\n")[0]

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from epo_lightning import registry
 from epo_lightning.forecast import JointForecast
+from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.scene import Scene
 
 
@@ -72,3 +73,41 @@ def test_metrics_that_some_runs_lack_and_corrected_ones_do_not_prevent_a_report(
     assert epo("report", "runs=runs", "out=second") == 0
     mean = (stored(0)["own/speed"] + stored(1)["own/speed"]) / 2
     assert f"{mean:.3f}" in table_of(tmp_path / "second")
+
+
+def test_a_metric_that_fails_is_found_before_the_first_step(
+    epo: Epo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def broken(forecast: JointForecast, scene: Scene) -> Tensor:
+        return forecast.speeds  # type: ignore[attr-defined,no-any-return]
+
+    monkeypatch.setattr(registry, "_PARTS", {**registry._PARTS, "metric": {"broken": broken}})
+    steps: list[int] = []
+    monkeypatch.setattr(Forecaster, "training_step", lambda self, scene, index: steps.append(index))
+    assert epo("train", "experiment=rpi/v_lstm_sc", "data=drawn", "budget=smoke", "callbacks.progress=none") == 2
+    assert "the metric 'broken' fails at" in capsys.readouterr().err
+    assert not steps
+
+
+def test_a_monitored_score_may_be_missing_in_the_first_validated_batch(
+    epo: Epo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two batches are validated after training; the score has values in the second one only."""
+    calls: list[int] = []
+
+    def late(forecast: JointForecast, scene: Scene) -> Tensor:
+        calls.append(len(scene.history))
+        speed = top_speed(forecast, scene)
+        return speed if len(calls) > 2 else speed * float("nan")
+
+    monkeypatch.setattr(registry, "_PARTS", {**registry._PARTS, "metric": {"late": late}})
+    words = (
+        "experiment=rpi/v_lstm_sc",
+        "data=drawn",
+        "budget=smoke",
+        "callbacks.progress=none",
+        "trainer.max_epochs=1",
+    )
+    assert epo("train", *words, "callbacks.monitor=val/own/late", "run_dir=runs/late") == 0
+    assert len(calls) > 2
+    assert json.loads((tmp_path / "runs" / "late" / "run.json").read_text())["best"]["val/own/late"] > 0

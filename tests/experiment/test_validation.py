@@ -89,6 +89,7 @@ def test_progress_lines_of_a_resumed_run_know_its_best_score(
     kept = callbacks.ModelCheckpoint(tmp_path, monitor="val/minSADE")
     kept.best_model_score = torch.tensor(0.1)
     trainer: Any = SimpleNamespace(
+        sanity_checking=False,
         checkpoint_callbacks=[kept],
         callback_metrics={"val/minSADE": torch.tensor(0.3)},
         current_epoch=4,

@@ -178,7 +178,7 @@ def test_mean_median_and_percentiles_of_times_stand_below_their_names(tmp_path: 
     shown = dict(zip(chart.header, chart.numbers[1], strict=True))
     assert shown.pop("run") == str(runs[1].path)
     expected = {"N": "3", "S": "6", "M": "5", "mean": "4.0 ms", "median": "3.0 ms"}
-    assert shown == {**expected, "10% to 90%": "2.0 ms to 9.0 ms", "samples": "70"}
+    assert shown == {**expected, "10 % to 90 %": "2.0 ms to 9.0 ms", "forecasts": "70"}
     sheet = timing_sheet("here", timings)
     listed = dict(zip(sheet.header, sheet.lines[1], strict=True))
     assert {name: listed[name] for name in expected} == expected

@@ -65,15 +65,20 @@ def simulator() -> tuple[ModuleType, Path]:
     """The module of SUMO, and the folder of its programs.
 
     Raises:
-        ConfigError: SUMO is not installed.
+        ConfigError: SUMO is not installed, or the system lacks libraries that it needs.
     """
     try:
         with redirect_stdout(io.StringIO()):  # it prints a warning about pyarrow, which is not used with it
             import libsumo
             import sumo
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise ConfigError(
             f"simulated traffic needs the simulator SUMO ({error}): install it with `pip install 'epo_lightning[sim]'`"
+        ) from None
+    except ImportError as error:
+        raise ConfigError(
+            f"SUMO is installed, but a library of the system is missing ({error}): on Debian and Ubuntu, "
+            "`apt-get install libgl1 libxext6 libxrender1`"
         ) from None
     return libsumo, Path(sumo.SUMO_HOME) / "bin"
 

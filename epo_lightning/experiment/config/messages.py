@@ -66,6 +66,9 @@ def one_sentence(instance: Hydra, name: str, overrides: Sequence[str]) -> Iterat
                 f"{several.group(1)} has several values: for a run of each, add -m, or use a sweep; a text with a comma "
                 "needs quotes of its own, \"key='a,b'\""
             ) from error
+        kinds = r"Error merging override ([^=]+)=(.+); Cannot merge DictConfig with ListConfig"
+        if other := re.search(kinds, sentence(error)):
+            raise ConfigError(_other_kind(*other.groups())) from error
         raise ConfigError(_in_file(str(error)) or sentence(error)) from error
     except ValueError as error:  # Hydra's own, for example debug=null
         if isinstance(error, ConfigError):
@@ -103,6 +106,14 @@ def _in_file(message: str) -> str:
         return ""
     file, key = found.groups()
     return f"{file}.yaml has an unknown key {key!r} under hydra: a sweep's values stand in hydra.sweeper.params"
+
+
+def _other_kind(key: str, value: str) -> str:
+    """The error message for a list in the place of a dictionary, or a dictionary in the place of a list."""
+    replaced = f"~{key} +{key}='{value}'"
+    if value.startswith("["):
+        return f"{key} is a dictionary: set one entry by {key}.<name>=<value>, or replace the whole by {replaced}"
+    return f"{key} is a list, which cannot become the dictionary {value} in one word: replace it by {replaced}"
 
 
 def _chosen(overrides: Sequence[str]) -> str:

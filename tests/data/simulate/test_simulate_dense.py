@@ -58,7 +58,7 @@ def test_no_vehicle_is_asked_to_drive_backwards() -> None:
 
 
 def road(folder: Path, style: Style | None, monkeypatch: pytest.MonkeyPatch, seconds: float, warm_up: float) -> Motion:
-    pytest.importorskip("libsumo", reason="the traffic simulator is not installed: pip install 'epo_lightning[sim]'")
+    pytest.importorskip("libsumo", reason="SUMO cannot be loaded", exc_type=ImportError)
     monkeypatch.setattr(traffic, "WARM_UP", warm_up)
     folder.mkdir()
     options = {} if style is None else {"style": style}

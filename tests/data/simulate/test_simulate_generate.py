@@ -126,21 +126,21 @@ def test_every_recording_and_every_seed_has_traffic_of_its_own(tmp_path: Path, m
 
 
 def test_recordings_with_many_implausible_vehicles_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    pytest.importorskip("libsumo", reason="the traffic simulator is not installed: pip install 'epo_lightning[sim]'")
+    pytest.importorskip("libsumo", reason="SUMO cannot be loaded", exc_type=ImportError)
     monkeypatch.setattr(generate, "MOST_DROPPED", -1.0)
     with pytest.raises(ConfigError, match=r"recording 0 on layout diverge: 0 of \d+ vehicles move implausibly"):
         generate.record(tmp_path, "", 0, LAYOUTS[2], 3, 2.0)
 
 
 def test_recordings_without_lane_changes_are_refused(tmp_path: Path):
-    pytest.importorskip("libsumo", reason="the traffic simulator is not installed: pip install 'epo_lightning[sim]'")
+    pytest.importorskip("libsumo", reason="SUMO cannot be loaded", exc_type=ImportError)
     with pytest.raises(ConfigError, match=r"no vehicle changes lane in 0\.04 s: use more minutes"):
         generate.record(tmp_path, "", 0, LAYOUTS[2], 3, 0.04)
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    pytest.importorskip("libsumo", reason="the traffic simulator is not installed: pip install 'epo_lightning[sim]'")
+    pytest.importorskip("libsumo", reason="SUMO cannot be loaded", exc_type=ImportError)
     return make_recordings(tmp_path_factory.mktemp("two") / "set", SMALL, workers=2, progress=False)
 
 

@@ -29,7 +29,7 @@ LAYOUT, SEED, SECONDS = LAYOUTS[4], [5, 4], 40.0
 
 
 def run(folder: Path) -> Motion:
-    pytest.importorskip("libsumo", reason="the traffic simulator is not installed: pip install 'epo_lightning[sim]'")
+    pytest.importorskip("libsumo", reason="SUMO cannot be loaded", exc_type=ImportError)
     return move(simulate(LAYOUT, SEED, SECONDS, folder), LAYOUT, SECONDS)
 
 
@@ -238,7 +238,7 @@ def test_the_filter_keeps_cubics_and_their_derivatives():
 
 
 def test_ramps_have_a_speed_limit_of_their_own(tmp_path: Path):
-    pytest.importorskip("libsumo", reason="the traffic simulator is not installed: pip install 'epo_lightning[sim]'")
+    pytest.importorskip("libsumo", reason="SUMO cannot be loaded", exc_type=ImportError)
     edges = edges_of(LAYOUT)
     net = ElementTree.parse(write_network(LAYOUT, edges, simulator()[1], tmp_path))
     limits = {edge.get("id"): [float(lane.get("speed")) for lane in edge.findall("lane")] for edge in net.iter("edge")}
@@ -251,4 +251,12 @@ def test_ramps_have_a_speed_limit_of_their_own(tmp_path: Path):
 def test_a_missing_simulator_is_named_with_the_remedy(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "libsumo", None)
     with pytest.raises(ConfigError, match=r"pip install 'epo_lightning\[sim\]'"):
+        simulator()
+
+
+def test_a_missing_library_of_the_system_is_named_with_the_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "libsumo.py").write_text('raise ImportError("libX11.so.6: cannot open shared object file")')
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "libsumo", raising=False)
+    with pytest.raises(ConfigError, match=r"a library of the system is missing \(libX11.*`apt-get install libgl1 "):
         simulator()
