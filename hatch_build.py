@@ -6,7 +6,6 @@ A machine without a C++ compiler gets a package without the kernel, which says s
 from __future__ import annotations
 
 import importlib.util
-import sysconfig
 from pathlib import Path
 from typing import Any
 
@@ -32,4 +31,4 @@ class KernelHook(BuildHookInterface):
         build_data["artifacts"].append(str(kernel.LIBRARY.relative_to(self.root)))
         # A library, but not one of Python's: one wheel per platform serves all versions.
         build_data["pure_python"] = False
-        build_data["tag"] = f"py3-none-{sysconfig.get_platform().replace('-', '_').replace('.', '_')}"
+        build_data["tag"] = f"py3-none-{kernel.platform_tag()}"

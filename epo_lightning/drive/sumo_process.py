@@ -173,8 +173,8 @@ def _nothing() -> Generator[_Road]:
 def _closed(pipe: Connection) -> bool:
     """Whether the other end is closed, because its process closed it or was killed; messages are left where they are."""
     poll = select.poll()
-    poll.register(pipe.fileno(), 0)
-    return bool(poll.poll(0))
+    poll.register(pipe.fileno(), select.POLLHUP)
+    return any(event & select.POLLHUP for _, event in poll.poll(0))
 
 
 def _stream(branch: Branch, pipe: Connection) -> Generator[_Road]:

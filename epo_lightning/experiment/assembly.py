@@ -25,7 +25,7 @@ from epo_lightning.backbones.base import Backbone
 from epo_lightning.backbones.trial import try_backbone
 from epo_lightning.data.datamodule import check_divisible
 from epo_lightning.data.recorded.recordings import RecordedData
-from epo_lightning.experiment import debugging, step_graph
+from epo_lightning.experiment import debugging, gpus, step_graph
 from epo_lightning.experiment.checkpoints import WholeCheckpoints
 from epo_lightning.experiment.config.replaced import keys_of
 from epo_lightning.experiment.config.settings import PARTS, Settings, TrainerSettings
@@ -257,7 +257,7 @@ def build_trainer(
     with naming(settings, run):
         return Trainer(
             default_root_dir=run.path,
-            accelerator=settings.accelerator,
+            accelerator=gpus.accelerator(settings),
             devices=devices,
             strategy=strategy or "auto",
             # In a Slurm job, Lightning would otherwise install its signal handlers and compare the number of tasks.

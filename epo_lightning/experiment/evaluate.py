@@ -16,7 +16,7 @@ from lightning.pytorch.callbacks import TQDMProgressBar
 from epo_lightning import pretrained
 from epo_lightning.data.cache import file_digest
 from epo_lightning.data.rpi.scenes import RPIData
-from epo_lightning.experiment import assembly, logs
+from epo_lightning.experiment import assembly, gpus, logs
 from epo_lightning.experiment.callbacks import style_of
 from epo_lightning.experiment.config.replaced import keys_of
 from epo_lightning.experiment.config.settings import EvaluateSettings, Settings, TrainerSettings
@@ -169,7 +169,7 @@ def _test(
     double = of_run.trainer.precision == "64-true"
     with assembly.naming(machine, run):
         trainer = Trainer(
-            accelerator=machine.accelerator,
+            accelerator=gpus.accelerator(machine),
             devices=devices if machine.devices == 1 else 1,
             precision=None if double else of_run.trainer.precision,  # type: ignore[arg-type]
             plugins=[assembly.Double()] if double else None,

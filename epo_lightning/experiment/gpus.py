@@ -13,10 +13,21 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Literal
 
 import torch
 
 from epo_lightning.experiment.config.settings import TrainerSettings
+
+
+def accelerator(settings: TrainerSettings) -> Literal["cpu", "cuda"]:
+    """Name of the accelerator that Lightning's Trainer gets.
+
+    GPUs are those of CUDA. Apple's, which Lightning would take as well, have no float64, in which scores are summed.
+    """
+    if settings.accelerator == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    return "cpu" if settings.accelerator == "cpu" else "cuda"
 
 
 @contextmanager
@@ -27,7 +38,7 @@ def placed(settings: TrainerSettings) -> Iterator[int | list[int]]:
         the argument ``devices`` of Lightning's Trainer: the index of that GPU in a list, or a number of devices for runs on
         a CPU or on several devices.
     """
-    if settings.accelerator == "cpu" or settings.devices > 1 or not torch.cuda.is_available():
+    if accelerator(settings) == "cpu" or settings.devices > 1 or not torch.cuda.is_available():
         yield settings.devices
         return
     count = torch.cuda.device_count()

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import platform
 import subprocess
 import sys
+import sysconfig
 import zipfile
 from pathlib import Path
 
 import pytest
+
+from epo_lightning.solvers.gauss_newton.kernel import build
 
 ROOT = Path(__file__).parents[2]
 
@@ -19,6 +23,15 @@ from epo_lightning.solvers.gauss_newton.backends import compiled
 from epo_lightning.solvers.gauss_newton.kernel import interface
 print(Path(compiled.__file__).parents[3], interface.library().epo_levels() > 0)
 """
+
+
+def test_on_macos_the_wheel_is_for_its_system_and_processor(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python's own names there are refused by pip (macosx-14.5-arm64), or promise other processors (universal2)."""
+    assert build.platform_tag() == sysconfig.get_platform().replace("-", "_").replace(".", "_")
+    monkeypatch.setattr(sys, "platform", "darwin")
+    monkeypatch.setattr(platform, "system", lambda: "Darwin")
+    monkeypatch.setattr(platform, "mac_ver", lambda: ("14.5", ("", "", ""), "arm64"))
+    assert build.platform_tag() == "macosx_14_0_arm64"
 
 
 @pytest.mark.slow

@@ -27,6 +27,8 @@ from epo_lightning.files import read_json
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder
 
+pytestmark = pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="processes are found in /proc")
+
 ROOT = Path(__file__).parents[2]
 FIXTURE = ROOT / "tests" / "fixtures" / "exid_sim"
 RPI = ("data.games=6", "data.placements=1")

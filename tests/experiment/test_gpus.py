@@ -7,9 +7,13 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+from lightning.pytorch.accelerators import CPUAccelerator
 
+from epo_lightning.experiment.assembly import build_trainer
 from epo_lightning.experiment.config.settings import TrainerSettings
-from epo_lightning.experiment.gpus import place, placed
+from epo_lightning.experiment.gpus import accelerator, place, placed
+from epo_lightning.registry import ConfigError
+from epo_lightning.run_folder import RunFolder
 
 
 def test_empty_gpus_are_taken_before_shared_ones(tmp_path: Path) -> None:
@@ -52,3 +56,17 @@ def test_runs_on_cpu_take_no_gpu() -> None:
     settings = TrainerSettings(accelerator="cpu", devices=3)
     with placed(settings) as devices:
         assert devices == 3
+
+
+@pytest.mark.parametrize("cuda", [False, True])
+def test_gpus_are_those_of_cuda(cuda: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lightning would also take Apple's, which cannot sum scores in float64."""
+    monkeypatch.setattr("torch.cuda.is_available", lambda: cuda)
+    monkeypatch.setattr("lightning.pytorch.accelerators.mps.MPSAccelerator.is_available", lambda: True)
+    found = {name: accelerator(TrainerSettings(accelerator=name)) for name in ("cpu", "gpu", "auto")}
+    assert found == {"cpu": "cpu", "gpu": "cuda", "auto": "cuda" if cuda else "cpu"}
+    if not cuda:
+        run = RunFolder(tmp_path)
+        assert isinstance(build_trainer(TrainerSettings(accelerator="auto"), run, []).accelerator, CPUAccelerator)
+        with pytest.raises(ConfigError, match=r"no device for trainer\.accelerator=gpu"):
+            build_trainer(TrainerSettings(accelerator="gpu"), run, [])

@@ -139,7 +139,10 @@ def test_copies_of_a_recording_are_named(folder):
 
 
 def test_a_name_that_is_not_utf_8_is_refused_at_once(folder):
-    (Path(os.fsdecode(os.fsencode(folder) + b"/c-\xff.road"))).write_text("0.5")
+    try:
+        (Path(os.fsdecode(os.fsencode(folder) + b"/c-\xff.road"))).write_text("0.5")
+    except OSError:
+        pytest.skip("this file system refuses such names itself")
     with pytest.raises(ConfigError, match=r"'c-\\udcff' is not UTF-8: rename"):
         data(folder).generate(workers=1, progress=False)
 

@@ -52,7 +52,7 @@ def commonroad(folder: Path) -> list[RecordingSource]:
         RecordingError: there is no scenario, two have the same name, or a file cannot be read.
     """
     # Links to nowhere are kept: a recording that is not there must not be left out in silence.
-    paths = sorted(path for path in Path(folder).rglob("*.xml") if not path.is_dir())
+    paths = sorted(path for path in Path(folder).rglob("[!.]*.xml") if not path.is_dir())
     if not paths:
         raise RecordingError(folder, "there is no CommonRoad scenario (*.xml) in this folder")
     first: dict[str, Path] = {}

@@ -79,7 +79,7 @@ def crowd(folder: Path, rate: float = DUT_RATE) -> list[RecordingSource]:
     if isinstance(rate, bool) or not isinstance(rate, int | float) or not 1.0 <= rate <= 1000.0:
         raise ConfigError(f"data.options.rate must be frames per second, between 1 and 1000, not {rate!r}")
     clips: dict[str, dict[str, Path]] = {}
-    for path in sorted(folder.rglob("*_traj_*_filtered.csv")):
+    for path in sorted(folder.rglob("[!.]*_traj_*_filtered.csv")):
         if match := re.fullmatch(r"(.+)_traj_(ped|veh)_filtered\.csv", path.name):
             tables = clips.setdefault(match[1], {})
             if match[2] in tables:

@@ -20,6 +20,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import sysconfig
 import tempfile
 from pathlib import Path
 
@@ -124,6 +125,16 @@ def _serves(target: Path, portable: bool) -> bool:
 
 def _x86() -> bool:
     return platform.machine().lower() in ("x86_64", "amd64")
+
+
+def platform_tag() -> str:
+    """Tag, as wheels have one, of the platforms that can load the library built here."""
+    if sys.platform == "darwin":
+        # Python's own name may be one of several processors or of an older macOS, or one that pip does not know.
+        from packaging.tags import platform_tags
+
+        return next(platform_tags())
+    return sysconfig.get_platform().replace("-", "_").replace(".", "_")
 
 
 def build(target: Path = LIBRARY, portable: bool = False) -> None:
