@@ -193,7 +193,7 @@ def test_the_validation_score_is_the_lowest_of_the_log(tmp_path: Path) -> None:
         ('{{ results("rpi_goal", data="rpi") }}', "line 1: .*found rpi; did you mean 'rpi_hard'"),
         (
             '\n{% set rows = results("rpi_hard") %}{{ rows["V-LSTM"].over(rows["V-LSTM"] - rows["V-LSTM"], "SADE") }}',
-            "line 2: division by zero",
+            "line 2: .*division by zero",
         ),
         ("a\n{{ nothing.text() }}", "line 2: 'nothing' is undefined"),
         ('a\n{% set one, two = results("rpi_hard").values() %}', "line 2: too many values to unpack"),
