@@ -81,22 +81,21 @@ def until(function: Callable[..., Tensor], ends: Int[Tensor, " E"] | None) -> Ca
     if ends is None:
         return function
 
+    rows = {length: (ends == length).nonzero()[:, 0] for length in ends.unique().tolist()}
+    missing = rows.pop(0, ends.new_zeros(0))
+    order = torch.cat([*rows.values(), missing]).argsort()
+
     def shortened(*given: Tensor) -> Tensor:
-        parts, rows = [], []
-        for length in ends.unique().tolist():
-            row = (ends == length).nonzero()[:, 0]
+        parts = []
+        for length, row in rows.items():
             some = [tensor.index_select(0, row) if len(tensor) == len(ends) else tensor for tensor in given]
             some[:2] = [tensor[..., :length, :] for tensor in some[:2]]
-            if length:
-                parts.append(function(*some))
-                rows.append(row)
+            parts.append(function(*some))
         if not parts:
             return given[0][..., 0, :0]
         most = max(part.shape[-1] for part in parts)
         parts = [torch.nn.functional.pad(part, (0, most - part.shape[-1])) for part in parts]
-        missing = ends.eq(0).nonzero()[:, 0]
         parts.append(parts[0].new_zeros(len(missing), *parts[0].shape[1:]))
-        order = torch.cat([*rows, missing]).argsort()
         return torch.cat(parts).index_select(0, order)
 
     return shortened

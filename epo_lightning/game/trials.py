@@ -51,7 +51,7 @@ def agents() -> tuple[tuple[Float[Tensor, "*batch K 4"], Float[Tensor, "*batch 1
 
 @cache
 @torch.inference_mode(False)
-def numbers(*shape: int) -> Float[Tensor, "*batch K *shape"]:
+def numbers(*shape: int) -> Float[Tensor, "4 64 K *shape"]:
     """Values of signals or controls from -10 to 10, the same at every call."""
     generator = torch.Generator().manual_seed(1)
     drawn = torch.rand(*SHAPE, _STEPS, *shape, generator=generator, dtype=torch.float64, device="cpu")
