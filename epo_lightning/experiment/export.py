@@ -34,6 +34,8 @@ OUTPUTS = ("states", "probabilities")
 """Outputs of a program, by name."""
 NOT_READ = ("dt", "future", "future_mask", "subset", "id", "frame")
 """Fields of a scene that no forecaster reads."""
+PYTORCH = "2.11"
+"""First version of PyTorch with which all programs were tried; 2.7 and 2.9 fail in ``torch.export``."""
 TOLERANCE = 1e-5
 """Largest difference between the outputs of a program and those of its forecaster, divided by values above 1.
 
@@ -119,8 +121,13 @@ def check_exportable(forecaster: Forecaster, title: str, form: Format) -> None:
     """Refuse forecasters with a number of steps that depends on values, and those with operations that the format lacks.
 
     Raises:
-        ConfigError: see above; the message names the part.
+        ConfigError: see above; the message names the part. Or PyTorch is too old.
     """
+    if torch.__version__ < PYTORCH:
+        raise ConfigError(
+            f"epo export needs PyTorch {PYTORCH} or later, and {torch.__version__} is installed: "
+            f"pip install 'torch>={PYTORCH}'"
+        )
     games = games_of(forecaster)
     if games and not form.games:
         raise ConfigError(

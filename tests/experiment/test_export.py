@@ -13,6 +13,7 @@ from typing import Any
 import jaxtyping
 import pytest
 import torch
+from torch.torch_version import TorchVersion
 
 import epo_lightning
 from epo_lightning import pretrained
@@ -140,6 +141,13 @@ def test_the_cpp_example_gives_the_forecasts_of_the_forecaster(
         wanted = forecaster.predict(scenes[slice(count)])
         torch.testing.assert_close(states, wanted.states, atol=1e-5, rtol=1e-5)
         torch.testing.assert_close(probabilities, wanted.probabilities, atol=1e-5, rtol=1e-5)
+
+
+def test_an_old_pytorch_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch, "__version__", TorchVersion("2.9.1+cu130"))
+    forecaster = epo_lightning.load("rpi/v_lstm_sc")
+    with pytest.raises(ConfigError, match=r"needs PyTorch 2\.11 or later, and 2\.9\.1\+cu130 is installed"):
+        check_exportable(forecaster, "+SC", FORMATS["pt2"])
 
 
 def test_what_takes_as_many_steps_as_the_values_need_is_refused() -> None:
