@@ -88,6 +88,14 @@ def test_intervals_and_areas_are_read_as_their_centres(tmp_path):
         (RECTANGLE.replace("</width>", "</width><originXShift>-1.5</originXShift>"), [5, 2], [10, 21.5]),
         (RECTANGLE.replace("</width>", "</width><center><x>1</x><y>-0.5</y></center>"), [5, 2], [10.5, 21]),
         (RECTANGLE.replace("</width>", f"</width><orientation>{np.pi / 2}</orientation>"), [2, 5], [10, 20]),
+        (RECTANGLE.replace("</width>", f"</width><orientation>{np.pi}</orientation>"), [5, 2], [10, 20]),
+        (
+            RECTANGLE.replace(
+                "</width>", f"</width><orientation>{np.pi / 2}</orientation><originXShift>-1.5</originXShift>"
+            ),
+            [2, 5],
+            [8.5, 20],
+        ),
     ],
 )
 def test_positions_are_those_of_the_centre(tmp_path, shape, size, centre):
@@ -153,6 +161,9 @@ def test_lanes_equal_the_lanelets_of_the_scenario(tmp_path):
         ("no_marking", True, True),
         ("solid", False, False),
         ("broad_solid", False, False),
+        ("solid_solid", False, False),
+        ("curb", False, False),
+        ("lowered_curb", False, False),
         ("solid_dashed", True, False),
         ("dashed_solid", False, True),
     ],
@@ -171,14 +182,18 @@ def test_left_out_content_is_counted(tmp_path):
     static = f'<staticObstacle id="30"><type>parkedVehicle</type><shape>{RECTANGLE}</shape></staticObstacle>'
     standing = state(0, point(0, 0))
     silent = re.sub("<velocity>.*?</velocity>", "", drive(34, [10.0, 11.0]))
+    in_part = re.sub("<velocity>.*?</velocity>", "", drive(35, [10.0, 11.0, 12.0]), count=1)
     content = scenario(
         lanelet(1),
         lanelet(2).replace("<x>50.0</x>", "<x>0.0</x>").replace("<x>100.0</x>", "<x>0.0</x>"),
+        re.sub("<leftBound>.*</leftBound>", f"<leftBound>{point(0, 2) * 3}</leftBound>", lanelet(3)),
         static,
         static.replace("30", "31"),
         obstacle(32, [standing]),
         drive(33, [10.0, 11.0], shape=RECTANGLE * 2),
         silent,
+        in_part,
+        '<environmentObstacle id="36"/><phantomObstacle id="37"/><phantomObstacle id="38"/>',
         CAR,
     )
     recording = read(tmp_path, content)
@@ -186,10 +201,12 @@ def test_left_out_content_is_counted(tmp_path):
     assert recording.lanes.ids.tolist() == [1]
     assert recording.dropped == {
         "static obstacles": 2,
+        "environment obstacles": 1,
+        "phantom obstacles": 2,
         "obstacles without a trajectory": 1,
         "obstacles whose shape is not one rectangle, circle or polygon": 1,
-        "obstacles without velocities": 1,
-        "lanes without length": 1,
+        "obstacles without velocities": 2,
+        "lanes without length": 2,
     }
 
 
@@ -209,3 +226,34 @@ def test_a_planning_problem_without_traffic_has_no_tracks(tmp_path):
     shapes = {name: value.shape for name, value in vars(tracks).items() if name != "rate"}
     assert shapes.pop("position") == shapes.pop("velocity") == shapes.pop("size") == (0, 2)
     assert set(shapes.values()) == {(0,)}
+
+
+SPEED_SIGNS = ("274", "274.1", "R2-1", "r301", "3.24", "R15", "C43", "B14", "\u03a1-32", "B31")
+
+
+def sign(identity: int, *limits: tuple[str, float]) -> str:
+    elements = "".join(
+        f"<trafficSignElement><trafficSignID>{name}</trafficSignID><additionalValue>{value}</additionalValue>"
+        "</trafficSignElement>"
+        for name, value in limits
+    )
+    return f'<trafficSign id="{identity}">{elements}</trafficSign>'
+
+
+@pytest.mark.parametrize("name", SPEED_SIGNS)
+def test_the_speed_limit_of_a_lane_is_the_lowest_that_its_signs_and_itself_state(tmp_path, name):
+    refs = '<trafficSignRef ref="70"/><trafficSignRef ref="71"/>'
+    content = scenario(
+        lanelet(1, rest=refs),
+        lanelet(2, 4.0, rest=f"<speedLimit>8</speedLimit>{refs}"),
+        sign(70, ("310", 5.0), (name, 12.5)),
+        sign(71, (name, 20.0)),
+        CAR,
+    )
+    assert read(tmp_path, content).lanes.speed_limit.tolist() == [12.5, 8.0]
+
+
+def test_borders_and_shoulders_are_not_driven_on_regularly(tmp_path):
+    kinds = [f"<laneletType>{name}</laneletType>" for name in ("border", "shoulder", "exitRamp")]
+    lanes = read(tmp_path, scenario(*(lanelet(k, 4.0 * k, rest=kind) for k, kind in enumerate(kinds)))).lanes
+    assert lanes.kind.tolist() == [SHOULDER, SHOULDER, LANE]

@@ -54,6 +54,20 @@ def test_scenes_that_overlap_are_grouped(tmp_path):
     assert all(source.read().group == source.group for source in sources)
 
 
+@pytest.mark.parametrize("version", ["2018b", "2020a"])
+@pytest.mark.parametrize(("identity", "same"), [(1, 12), (2, 40)])
+def test_the_fewest_speeds_that_show_the_same_vehicle(tmp_path, identity, same, version):
+    """Twelve under the same id, and forty under another one."""
+    long = speeds(0, 60)
+    for count in (same - 1, same):
+        (tmp_path / f"{count}").mkdir()
+        cuts = {"a": drive(1, long[:50], version=version), "b": drive(identity, long[50 - count :], version=version)}
+        for name, content in cuts.items():
+            (tmp_path / f"{count}" / f"{name}.xml").write_text(scenario(content, version=version))
+        groups = [source.group for source in commonroad(tmp_path / f"{count}")]
+        assert groups == (["a", "a"] if count == same else ["a", "b"])
+
+
 def test_a_link_to_nowhere_is_refused_and_a_folder_is_no_scenario(tmp_path):
     (tmp_path / "a.xml").write_text(SCENARIO)
     (tmp_path / "folder.xml").mkdir()

@@ -121,7 +121,7 @@ def test_the_frame_rate_is_an_option(tmp_path):
     assert read(write(tmp_path), rate=24).tracks.rate == 24.0
     with pytest.raises(RecordingError, match=r"1\.67 times as fast .* at 40 frames per second \(data\.options\.rate\)"):
         read(tmp_path, rate=40)
-    for rate in (0.0, "24", None, True, float("nan")):
+    for rate in (0.0, 0.5, "24", None, True, float("nan")):
         with pytest.raises(ConfigError, match=r"data\.options\.rate must be frames per second"):
             crowd(tmp_path, rate=rate)
 
@@ -157,6 +157,8 @@ def test_options_decide_on_the_data_set_and_unknown_ones_are_refused(tmp_path):
         (pedestrians().replace("1,3,ped", "1,3.5,ped"), None, "row 11: frame is '3.5'; a whole number was expected"),
         (pedestrians().replace("1,3,ped", "1,3,veh"), None, "row 11: label is 'veh'; 'ped' was expected in this file"),
         (pedestrians().replace("1,3,ped", "-1,3,ped"), None, "row 11: id is -1; 0 .. 999999 was expected"),
+        (pedestrians().replace("1,3,ped", "1000000,3,ped"), None, "row 11: id is 1000000; 0 .. 999999 was expected"),
+        (pedestrians().replace("1,3,ped", "1,-3,ped"), None, "row 11: frame -3 was expected in 0"),
         (pedestrians().replace("1,3,ped", "1,4,ped"), None, "track 1 has frame 4 twice"),
         (None, vehicles().replace("30.0", "inf", 1), r"veh_filtered.csv, row 3: x_est is inf; a finite number"),
         (None, vehicles(speed=90.0), "jumps from .* agents stay below 40 m/s"),
@@ -274,3 +276,18 @@ def test_errors_of_tracks_name_the_file_and_the_id_in_it(tmp_path):
     folder = crowded(tmp_path / "cars", repeated)
     with pytest.raises(RecordingError, match=r"square_01_traj_veh_filtered.csv: track 1 has frame 62 twice"):
         read(folder)
+
+
+def test_speeds_of_cars_may_lag_behind_their_positions(tmp_path):
+    """In a median of cars up to a factor of two, of pedestrians up to one of 1.25."""
+    folder = crowded(tmp_path / "cars", lambda text: scaled(text, {"vel_est": 0.55}))
+    assert read(folder).tracks.speed[-1] == 0.0
+    walking = scaled(pedestrians(), {"vx_est": 0.7, "vy_est": 0.7})
+    with pytest.raises(RecordingError, match=r"positions move 1\.43 times as fast as vx_est and vy_est say"):
+        read(write(tmp_path / "walks", ped=walking))
+
+
+def test_only_the_number_at_the_end_of_a_name_is_left_out_of_the_place(tmp_path):
+    for name in ("north_square_01", "north_road_02"):
+        write(tmp_path, name)
+    assert [source.group for source in crowd(tmp_path)] == ["north_road", "north_square"]

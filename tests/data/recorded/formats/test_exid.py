@@ -154,6 +154,31 @@ def test_left_out_content_is_counted(tmp_path):
     assert np.isnan(recording.lanes.speed_limit).all()
 
 
+def test_frames_missing_inside_tracks_may_be_counted_in_the_metadata_or_not(tmp_path):
+    tracks = drive()
+    gaps = tracks.filter((pl.col("trackId") != 10) | ~pl.col("frame").is_in([3, 4, 7]))
+    for name, meta in (("span", meta_of(tracks)), ("rows", meta_of(gaps))):
+        write(tmp_path / name, gaps, meta)
+        assert read(tmp_path / name).dropped == {"frames missing inside tracks": 3}
+
+
+def test_tracks_longer_than_the_recording_are_refused(tmp_path):
+    """Frames end 1.8 s after a duration of one second; tracks may be a second longer than stated."""
+    write(tmp_path / "long", drive(frames=60), setting=SETTING | {"duration": 1.0})
+    with pytest.raises(
+        RecordingError, match=r"frame 69 lies after the duration of 1\.0 s at the frameRate of 25\.0 Hz"
+    ):
+        read(tmp_path / "long")
+    write(tmp_path / "short", drive(frames=40), setting=SETTING | {"duration": 1.0})
+    assert read(tmp_path / "short").tracks.frame.max() == 49
+
+
+def test_a_recording_of_exid_states_its_speed_limit(tmp_path):
+    write(tmp_path, setting={key: value for key, value in SETTING.items() if key != "speedLimit"})
+    with pytest.raises(RecordingError, match=r"07_recordingMeta\.csv: there is no column speedLimit"):
+        exid(tmp_path)
+
+
 def test_every_recording_is_listed_with_its_own_map(tmp_path):
     write(tmp_path)
     data = tmp_path / "data"
@@ -208,6 +233,7 @@ def scaled(factor, *names):
         (at(4, xCenter=500.0), r"track 10 jumps from .* after its frame 3"),
         (at(4, heading=1e9), r"row 6: heading is 1000000000.0; degrees"),
         (at(4, heading=float("nan")), r"row 6: heading is nan; degrees"),
+        (at(4, heading=400.0), r"row 6: heading is 400.0; degrees"),
         (at(4, frame=-1), r"row 6: frame -1 was expected in 0"),
         (at(4, frame=2), r"frame 2 of track 10 comes after its frame 3: frames of a track must increase"),
         (at(4, frame=3), r"track 10 has frame 3 twice"),
@@ -235,6 +261,10 @@ def scaled(factor, *names):
         (
             lambda t: t.with_columns(pl.col("yCenter") + 50),
             r"location2.osm: 100% of the positions of 07_tracks.csv are more than 10 m",
+        ),
+        (
+            lambda t: t.with_columns(pl.col("yCenter") + 50 * (pl.col("trackId") > 10)),
+            r"location2.osm: 67% of the positions of 07_tracks.csv are more than 10 m",
         ),
     ],
 )

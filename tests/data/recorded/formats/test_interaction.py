@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from pathlib import Path
 
 import numpy as np
@@ -141,6 +142,7 @@ def test_a_recording_without_a_map_has_no_lanes(tmp_path):
         (("1,3,300,car", "1,3.5,350,car"), "row 4: frame_id is 3.5; a whole number in 0"),
         (("1,3,300,car", "1,2,200,car"), "track 1 has frame 2 twice"),
         (("1,3,300,car", "X1,3,300,car"), "row 4: track_id is 'X1'; a whole number below 1000000 was expected"),
+        (("1,3,300,car", "1000000,3,300,car"), "row 4: track_id is '1000000'; a whole number below 1000000"),
         ((",4.3,2.0", ",,2.0"), "there is no length; only pedestrians and cyclists may lack it"),
         ((",4.3,2.0", ",0,0"), "length and width .* of track 1 were expected to be positive"),
         (("psi_rad,length,width", "psi_rad,length,breadth"), "row 2: there is no width; only pedestrians"),
@@ -227,3 +229,66 @@ def test_errors_of_pedestrians_name_their_table(tmp_path, change, message):
     path.write_text(path.read_text().replace(*change))
     with pytest.raises(RecordingError, match=rf"pedestrian_tracks_000\.csv: {message}"):
         read(folder)
+
+
+@pytest.mark.parametrize("part", ["train", "val", "obs"])
+def test_every_table_of_the_challenge_is_a_recording_whose_map_may_lie_beside_its_folder(tmp_path, part):
+    (table,) = write_cases(tmp_path).rglob("*_train.csv")
+    table.rename(table.with_name(f"{PLACE}_{part}.csv"))
+    (source,) = interaction(table.parent)
+    assert (source.name, source.group) == (f"{PLACE}_{part}", PLACE)
+    assert source.files[-1] == tmp_path / "maps" / f"{PLACE}.osm"
+
+
+def test_of_two_maps_the_one_in_degrees_is_read(tmp_path):
+    (source,) = interaction(write_map(write_recording(tmp_path), ".osm_xy"))
+    assert [path.name for path in source.files if "maps" in path.parts] == [f"{PLACE}.osm"]
+
+
+def test_a_map_south_of_the_equator_lies_where_its_tracks_do(tmp_path):
+    (path,) = write_recording(tmp_path).rglob("*.osm")
+    path.write_text(path.read_text().replace("lat='0.00", "lat='-0.00"))
+    assert all((np.abs(line) < 2000).all() for line in read(tmp_path).lanes.left)
+
+
+def test_frames_of_a_case_end_before_those_of_the_next_one(tmp_path):
+    """A recording may be of any length."""
+    late = ("1,1,100,car", f"1,{CASE},{100 * CASE},car")
+    path = next(write_recording(tmp_path / "whole").rglob("vehicle_tracks_000.csv"))
+    lines = path.read_text().replace(*late).splitlines()
+    path.write_text("\n".join([*lines[:1], *lines[2:], lines[1]]) + "\n")
+    assert read(tmp_path / "whole").tracks.frame.max() == CASE
+    path = next(write_cases(tmp_path / "cases").rglob("*_train.csv"))
+    path.write_text(path.read_text().replace(*late))
+    with pytest.raises(RecordingError, match=r"frame_id is 1000; a whole number in 0 \.\. 999 was expected"):
+        read(tmp_path / "cases")
+
+
+def test_a_pedestrian_that_stands_keeps_its_heading_and_a_cyclist_needs_no_size(tmp_path):
+    folder = write_recording(tmp_path)
+    path = next(folder.rglob("pedestrian_tracks_000.csv"))
+    header, *rows = path.read_text().splitlines()
+    ways = [("1.0", "0.0"), ("0.0", "-0.2"), ("0.0", "1.0"), ("-0.2", "0.0")]
+    place, changed = np.array([900.0, 900.0]), []
+    for frame, way in enumerate(ways, 1):
+        changed.append(f"P7,{frame},{100 * frame},bicycle,{place[0]},{place[1]},{','.join(way)}")
+        place += 0.1 * np.array(way, dtype=float)
+    path.write_text("\n".join([header, *rows, *changed]) + "\n")
+    recording = read(folder)
+    tracks = recording.tracks
+    assert KINDS[tracks.kind[-1]] == "bicycle"
+    assert tracks.size[-1].tolist() == [1.8, 0.7]
+    assert recording.dropped["bicycles without a size, taken as 1.8 x 0.7 m"] == 1
+    np.testing.assert_allclose(tracks.heading[tracks.agent == 5], [0.0, 0.0, np.pi / 2, np.pi / 2])
+
+
+def test_nodes_in_metres_are_bounded_and_degrees_come_first(tmp_path):
+    path = tmp_path / "map.osm"
+    path.write_text(re.sub(r" x='[^']*'", " x='1e9'", map_text(metres=True), count=1))
+    with pytest.raises(RecordingError, match=r"node 1 at \[1000000000\.0, .* was expected in metres, at most 1e\+07 m"):
+        read_map(path, ZERO)
+    path.write_text(map_text())
+    expected = read_map(path, ZERO, zone=31, north=True)
+    path.write_text(map_text().replace(" lat=", " x='1' y='2' lat="))
+    found = read_map(path, ZERO, zone=31, north=True)
+    np.testing.assert_array_equal(np.concatenate(found.left), np.concatenate(expected.left))

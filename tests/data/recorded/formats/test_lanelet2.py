@@ -13,7 +13,7 @@ import shapely
 from data.recorded.formats.exid_files import BORDER, DASHED, ORIGIN, SOLID, Osm, globe, road, shared
 from epo_lightning.data.errors import RecordingError
 from epo_lightning.data.recorded.formats.centreline import centreline
-from epo_lightning.data.recorded.formats.lanelet2 import read_map
+from epo_lightning.data.recorded.formats.lanelet2 import _signed_distance, read_map
 from epo_lightning.data.recorded.lanes import LANE, SHOULDER
 
 FZI = "data/maps/fzi_mapping_example.osm"
@@ -161,7 +161,10 @@ def test_centrelines_of_random_roads_equal_those_of_lanelet2(tmp_path, seed):
     assert (lanes.adjacent_left >= 0).sum() > (lanes.left_of >= 0).sum() > 0
 
 
-@pytest.mark.parametrize("marking", MARKINGS, ids=lambda marking: "-".join(marking.values()))
+TRUE = [SOLID | {"lane_change": value} for value in ("true", "1")]
+
+
+@pytest.mark.parametrize("marking", [*MARKINGS, *TRUE], ids=lambda marking: "-".join(marking.values()))
 def test_markings_decide_on_lane_changes(tmp_path, marking):
     """Whether one may change across each marking, to either side, however its way is stored."""
     for number, backwards in enumerate((False, True)):
@@ -248,6 +251,42 @@ def test_lanes_of_a_ring_succeed_each_other(tmp_path):
     assert compare(tmp_path / "map.osm", ORIGIN).successors == [(1,), (0,)]
 
 
+def test_lanelets_for_some_vehicles_are_lanes_and_those_for_none_are_not(tmp_path):
+    osm = road()
+    osm.lanelets[0][3]["participant:vehicle:bus"] = "yes"
+    osm.lanelets[1][3]["participant:vehicle"] = "no"
+    for lanelet in osm.lanelets[2:]:
+        del lanelet[3]["subtype"]
+    (tmp_path / "map.osm").write_text(str(osm))
+    assert read_map(tmp_path / "map.osm", ORIGIN).ids.tolist() == [1, 3, 4, 5, 6]
+
+
+def test_of_lanelets_that_overlap_the_first_one_is_the_neighbour(tmp_path):
+    osm = road()
+    assert osm.lanelets[1][1:3] == (2, 3)
+    osm.lanelet(2, 3)
+    (tmp_path / "map.osm").write_text(str(osm))
+    lanes = read_map(tmp_path / "map.osm", ORIGIN)
+    assert (lanes.adjacent_right[0], lanes.adjacent_left[2]) == (1, 1)
+    assert (lanes.adjacent_left[6], lanes.adjacent_right[6]) == (0, 2)
+
+
+def test_lanes_of_two_points_that_close_at_their_end_are_read(tmp_path):
+    osm = Osm()
+    tip, *begins = (osm.node(x, y) for x, y in ((60.0, 0.0), (0.0, 3.5), (0.0, 0.0)))
+    osm.lanelet(*(osm.way([begin, tip], **DASHED) for begin in begins))
+    (tmp_path / "map.osm").write_text(str(unique(osm)))
+    compare(tmp_path / "map.osm", ORIGIN)
+
+
+@pytest.mark.parametrize(("x", "y", "left"), [(12.0, -0.3, True), (12.0, 0.3, True), (8.0, -0.3, False)])
+def test_a_point_before_a_sharp_right_turn_is_on_the_left(x, y, left):
+    line = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, -5.0]])
+    for sign in (1, -1):  # and mirrored, before a turn to the left
+        distance = _signed_distance(line * (1, sign), np.array([x, sign * y]))
+        assert (sign * distance > 0) == left
+
+
 def test_participants_and_drawn_centrelines_are_respected(tmp_path):
     osm = road()
     osm.lanelets[0][3]["participant:bicycle"] = "yes"
@@ -275,6 +314,23 @@ def test_other_zones_and_hemispheres_are_projected(tmp_path):
         found = read_map(tmp_path / "map.osm", (400_000.0, 5_800_000.0))
         np.testing.assert_array_equal(np.concatenate(found.left), np.concatenate(expected.left))
         np.testing.assert_allclose(found.left[0][0], (0.0, 7.5), atol=1e-5)
+        beside = read_map(tmp_path / "map.osm", (0.0, 0.0), zone=zone - 1, north=code == 32633)
+        assert len(beside) == 6, "a map may lie some degrees outside of its zone"
+
+
+def test_a_map_may_lie_on_both_sides_of_the_date_line(tmp_path):
+    from pyproj import Transformer
+
+    east, north = Transformer.from_crs("EPSG:4326", "EPSG:32660").transform(52.0, 180.0)
+    to_globe, text = Transformer.from_crs("EPSG:32660", "EPSG:4326"), str(road())
+    for id, x, y in road().nodes:
+        lat, lon = to_globe.transform(east + x - 100.0, north + y)
+        text = re.sub(rf"(<node id='{id}' .*) lat=.*/>", rf"\1 lat='{lat:.12f}' lon='{lon:.12f}'/>", text)
+    assert "lon='-179" in text
+    assert "lon='179" in text
+    (tmp_path / "map.osm").write_text(text)
+    lanes = read_map(tmp_path / "map.osm", (east - 100.0, north), zone=60)
+    np.testing.assert_allclose(lanes.left[0][0], (0.0, 7.5), atol=1e-5)
 
 
 def changed(pattern, replacement, count=0):
@@ -297,6 +353,7 @@ def changed(pattern, replacement, count=0):
         (changed(" lat='[0-9.]*'", "", 1), "lat of node 1 is missing; a finite number was expected there"),
         (changed(" lon='[0-9.]*'", " lon='NaN'", 1), "lon of node 1 is 'NaN'; a finite number"),
         (changed(" lat='[0-9.]*'", " lat='1e300'", 1), r"node 1 at latitude .* was expected in degrees"),
+        (changed(" lon='[0-9.]*'", " lon='19'", 1), r"node 1 at .* near UTM zone 32: is it a stray node"),
         (changed(" lon='[0-9.]*'", " lon='-173'", 1), r"node 1 at .* near UTM zone 32: is it a stray node"),
         (changed("<node id='2'", "<node id='1'"), "the id 1 belongs to two nodes: give one of them another id"),
         (changed("<way id='2'", "<way id='1'"), "the id 1 belongs to two ways"),
@@ -325,6 +382,10 @@ def test_invalid_maps_are_refused(tmp_path, change, message):
         (changed("(<way id='1' [^>]*>).*?<tag", r"\1<nd ref='1'/><tag", 1), "without length or width"),
         (changed("(<relation id='1' .*?ref='1'.*?)ref='2'", r"\1ref='1'", 1), "without length or width"),
         (changed("(<relation id='1' .*?)highway", r"\1crosswalk", 1), "that are not for vehicles"),
+        (
+            changed("(<relation id='1'[^>]*>)", r"\1<member type='way' ref='999' role='centerline'/>", 1),
+            "whose ways or nodes are missing",
+        ),
     ],
 )
 def test_left_out_content_is_counted(tmp_path, change, reason):

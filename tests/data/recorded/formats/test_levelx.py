@@ -114,10 +114,20 @@ def test_highd_lanes_lie_between_the_markings(tmp_path):
             np.testing.assert_array_equal(lanes.right[beside], left)
             assert lanes.right_of[beside] == lane
     assert lanes.left_of.tolist() == [1, -1, -1, 2, 3]
+    assert lanes.adjacent_left.tolist() == [1, -1, -1, 2, 3]
+    assert lanes.adjacent_right.tolist() == [-1, 0, 3, 4, -1]
+
+
+def test_highd_lanes_begin_before_all_vehicles_and_end_after_them(tmp_path):
+    path = write_highd(tmp_path) / "01_tracks.csv"
+    pl.read_csv(path).with_columns(pl.col("x") + 3).write_csv(path)
+    recording = read("highd", tmp_path)
+    assert np.ptp(recording.tracks.position[:, 0]) == 360.0
+    assert {tuple(sorted(centre[:, 0])) for centre in recording.lanes.centre} == {(20.0, 390.0)}
 
 
 @pytest.mark.parametrize("format", ["ind", "round", "unid"])
-@pytest.mark.parametrize("maps", ["maps/lanelet2", "maps", "lanelets"])
+@pytest.mark.parametrize("maps", ["maps/lanelet2", "maps/lanelets", "maps", "lanelet2", "lanelets", "data"])
 def test_urban_recordings_and_their_maps_are_read(tmp_path, format, maps):
     folder = write_urban(tmp_path, osm=urban_road(), maps=maps)
     recording = read(format, folder)
@@ -141,6 +151,52 @@ def test_urban_recordings_without_a_map_have_no_lanes(tmp_path):
     assert read("ind", folder).lanes is None
     with pytest.raises(RecordingError, match="there is no map of its locationId 4"):
         lookup("format", "exid")(folder)
+
+
+def test_a_vehicle_of_highd_that_rolls_backwards_keeps_its_direction(tmp_path):
+    path = write_highd(tmp_path) / "01_tracks.csv"
+    rolls, table = pl.col("id") == 9, pl.read_csv(path)
+    table.with_columns(
+        xVelocity=pl.when(rolls).then(-1.0).otherwise("xVelocity"),
+        x=pl.when(rolls).then(90.0 - (pl.col("frame") - 7) / RATE).otherwise("x"),
+    ).write_csv(path)
+    tracks = read("highd", tmp_path).tracks
+    mine = tracks.agent == 3
+    assert (np.abs(tracks.heading[mine]) < 0.1).all()
+    np.testing.assert_allclose(tracks.speed[mine], -1.0, atol=0.01)
+
+
+@pytest.mark.parametrize(("name", "kind"), [("trailer", "truck"), ("cyclist", "bicycle"), ("animal", "other")])
+def test_names_of_classes_are_kinds(tmp_path, name, kind):
+    path = write_urban(tmp_path) / "data" / "00_tracksMeta.csv"
+    path.write_text(path.read_text().replace(",car", f",{name}"))
+    recording = read("ind", tmp_path)
+    assert KINDS[recording.tracks.kind[0]] == kind
+    assert not any("unknown" in reason for reason in recording.dropped)
+
+
+def test_a_map_is_found_by_the_number_of_its_location_alone(tmp_path):
+    folder = write_urban(tmp_path, osm=urban_road())
+    write_urban(folder, osm=urban_road(), maps="data")
+    (folder / "maps" / "4_somewhere.osm").touch()
+    (folder / "maps" / "04_somewhere.osm").rename(folder / "maps" / "44_elsewhere.osm")
+    (source,) = lookup("format", "ind")(folder)
+    assert source.files[-1] == folder / "maps" / "4_somewhere.osm", "not the copy beside the tables"
+    (folder / "maps" / "4_somewhere.osm").rename(folder / "maps" / "location4.osm")
+    (source,) = lookup("format", "ind")(folder)
+    assert source.files[-1].name == "location4.osm"
+
+
+def test_a_recording_may_be_long_and_of_location_0_and_need_not_state_its_duration(tmp_path):
+    data = write_urban(tmp_path, location=0) / "data"
+    for name, columns in (("tracks", ["frame"]), ("tracksMeta", ["initialFrame", "finalFrame"])):
+        table = pl.read_csv(data / f"00_{name}.csv")
+        table.with_columns(pl.col(columns) + 40_000).write_csv(data / f"00_{name}.csv")
+    meta = data / "00_recordingMeta.csv"
+    pl.read_csv(meta).drop("duration", "speedLimit").write_csv(meta)
+    recording = read("ind", tmp_path)
+    assert recording.group == "0"
+    assert recording.tracks.frame.min() == 40_000
 
 
 @pytest.mark.parametrize(

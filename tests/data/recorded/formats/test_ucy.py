@@ -143,6 +143,7 @@ def test_rows_between_the_annotated_frames_are_left_out_and_counted(tmp_path):
         (ROWS.replace("31 5", "31.5 5"), "row 7: frame is '31.5'; a whole number"),
         (ROWS.replace("31 5", "31 1e12"), r"row 7: pedestrian is '1e12'; a whole number up to 1e\+09 was expected"),
         (ROWS.replace("31 5", "21 7"), "track 7 has frame 2 twice: is its id that of two agents"),
+        (ROWS + ROWS, "track 3 has frame 1 twice: is its id that of two agents"),
         (ROWS.replace("9.0", "9e9"), r"position \[9000000000.0, 9000000000.0\] of track 5 .* another unit"),
         (ROWS.replace("-1.0", "-999"), "velocity"),
         ("1 1 0 0 0 0 0 0\n1 2 0 0 0 0 0 0", "all rows are of one frame"),
@@ -204,3 +205,38 @@ def test_the_real_recordings_are_read():
         assert np.median(np.linalg.norm(moved - tracks.velocity[:-1][same], axis=1)) < 0.01
         assert tracks.speed.min() >= 0
         assert 0.5 < np.median(tracks.speed) < 2.0
+
+
+def test_people_who_stand_say_no_frame_rate(tmp_path):
+    frames = list(range(0, 180, 6))
+    standing = [
+        f"{frame} {id} {0.01 * (k % 2)} 0 {id} 0.05 0 0" for id in range(3, 9) for k, frame in enumerate(frames)
+    ]
+    assert read(tmp_path, "\n".join([walk(15.0, 6, frames), *standing])).tracks.rate == pytest.approx(2.5)
+
+
+def test_two_frames_of_their_own_phase_are_mistakes_and_three_are_a_series(tmp_path):
+    frames, phase = [*range(1, 101, 10), *range(151, 251, 10)], (104, 114, 124)
+    for count in (2, 3):
+        rows = "\n".join(f"{frame} 1 {1.2 * frame / 25} 0 1 1.2 0 0" for frame in phase[:count])
+        found = read(tmp_path, f"{walk(25.0, 10, frames)}\n{rows}").dropped
+        shifts = {"shifts of the annotated frames, where tracks are cut": 2}
+        assert found == ({"rows between the annotated frames": 2} if count == 2 else shifts)
+
+
+def test_the_shortest_series_is_left_out_first(tmp_path):
+    """The frames 1 and 11 belong to the others once 14 is gone."""
+    content = walk(25.0, 10, list(range(1, 201, 10)))
+    recording = read(tmp_path, content + "\n14 1 0 0 0 0 0 0")
+    assert recording.dropped == {"rows between the annotated frames": 1}
+    assert len(recording.tracks) == len(content.splitlines())
+
+
+def test_a_shift_after_a_pause_keeps_the_length_of_the_pause(tmp_path):
+    tracks = read(tmp_path, walk(15.0, 6, [*range(780, 840, 6), *range(863, 923, 6)])).tracks
+    assert sorted(set(np.diff(tracks.frame[tracks.agent == 0]).tolist())) == [1, 5]
+
+
+def test_a_recording_in_the_current_folder_has_the_name_of_the_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(write(tmp_path, ROWS).parent)
+    assert [source.name for source in ucy(Path())] == ["square"]
