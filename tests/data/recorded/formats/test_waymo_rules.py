@@ -100,6 +100,12 @@ def test_of_two_boundaries_the_nearer_one_counts(tmp_path):
     np.testing.assert_allclose(left, [(0.0, 1.6), (20.0, 1.6), (25.0, 2.4), (50.0, 2.4)])
 
 
+def test_where_a_line_turns_back_its_sides_are_those_before_the_turn(tmp_path):
+    lanes = read(tmp_path, features=[feature(1, 3, lane([(0.0, 0.0), (10.0, 0.0), (5.0, 0.0), (5.0, 9.0)]))]).lanes
+    assert [10.0, 1.8] in lanes.left[0].round(6).tolist()
+    assert [10.0, -1.8] in lanes.right[0].round(6).tolist()
+
+
 def test_other_folders_of_the_publisher_belong_to_its_splits(tmp_path):
     for home in ("training_20s", "validation_interactive", "testing_interactive"):
         write(tmp_path / home, [scenario()], f"{home}.tfrecord")

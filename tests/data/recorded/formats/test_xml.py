@@ -69,3 +69,10 @@ def test_text_that_is_no_number_is_refused(text):
         xml.number(text, "lat of node 3", "a.xml")
     with pytest.raises(RecordingError, match=r"^a.xml: lat of node 3 is .*; a whole number was expected there$"):
         xml.whole(text, "lat of node 3", "a.xml")
+
+
+def test_whole_numbers_fit_into_eight_bytes():
+    assert xml.whole(str(-(2**63)), "id", "a.xml") == -(2**63)
+    for value in (2**63, -(2**63) - 1):
+        with pytest.raises(RecordingError, match=rf"id is '{value}'; a whole number was expected"):
+            xml.whole(str(value), "id", "a.xml")
