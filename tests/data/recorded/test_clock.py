@@ -173,3 +173,27 @@ def test_a_recording_without_traffic_has_no_tracks():
     empty = {f.name: getattr(tracks, f.name)[:0] for f in dataclasses.fields(tracks) if f.name != "rate"}
     clock, _ = stretches(TrackTable(rate=10.0, **empty), 0.2, 1.0, 1)
     assert len(clock.count) == len(clock.state) == 0
+
+
+@pytest.mark.parametrize("smoothing", [0.01, 0.2])
+def test_the_shortest_window_of_the_filter_has_three_frames(smoothing):
+    """A parabola through three points keeps them; its derivative is the slope of a chord."""
+    tracks = dataclasses.replace(walk(1, 10.0, [40]), heading=np.zeros(40))
+    clock, _ = stretches(tracks, 0.1, smoothing, shortest=1)
+    np.testing.assert_allclose(clock.state[:, :2], tracks.position, atol=1e-9)
+    np.testing.assert_allclose(clock.state[1:-1, 3], (tracks.position[2:, 0] - tracks.position[:-2, 0]) * 5, atol=1e-9)
+
+
+def test_the_first_complete_window_of_the_filter_ends_at_its_last_frame():
+    """Positions move on although recorded velocities are zero; 25 frames of a second show it."""
+    frame = np.arange(1, 61)
+    tracks = dataclasses.replace(
+        walk(0, 25.0, [60]),
+        frame=frame,
+        position=np.stack([frame / 25.0, 0.0 * frame], 1),
+        heading=np.zeros(60),
+        velocity=np.zeros((60, 2)),
+    )
+    clock, _ = stretches(tracks, 0.2, 1.0, shortest=1)
+    assert clock.first.tolist() == [1]
+    np.testing.assert_allclose(clock.ending[:, 0, 3], [0.0] * 4 + [1.0] * 8, atol=1e-9)

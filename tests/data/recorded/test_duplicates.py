@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from dataclasses import dataclass
 from itertools import combinations
@@ -266,3 +267,42 @@ def test_a_run_identifies_a_vehicle_from_a_number_of_changes_on(changes: int, fo
     assert first.tolist() == [0] * found
     _, again = runs(Drives(RATE, agent, 50 + np.arange(RUN), place + 9.0, speed, np.array([3])))
     assert key.tolist() == again.tolist()
+
+
+def same_vehicles(one: Drives, other: Drives) -> int:
+    """Number of vehicles that two recordings have in common."""
+    mine, its = align([one, other]).vehicle
+    return len(np.intersect1d(mine, its))
+
+
+def test_recordings_of_different_rates_have_no_vehicle_in_common():
+    one = Drives.of(_raw(cut(3, "a", 0, 159, 1).recording))
+    assert same_vehicles(one, one) == len(one.ids)
+    assert same_vehicles(one, dataclasses.replace(one, rate=2 * RATE)) == 0
+
+
+@pytest.mark.parametrize(("noise", "same"), [(0.03, True), (0.3, False)])
+def test_the_same_vehicle_is_at_the_same_place_within_ten_centimetres_in_the_mean(noise, same):
+    one = Drives.of(_raw(cut(3, "a", 0, 159, 1).recording))
+    moved = one.position + np.random.default_rng(0).normal(0.0, noise, one.position.shape)
+    assert same_vehicles(one, dataclasses.replace(one, position=moved)) == (len(one.ids) if same else 0)
+
+
+def test_a_vehicle_that_stands_elsewhere_is_another_one():
+    one = Drives.of(_raw(cut(3, "a", 0, 159, 1).recording))
+    aside = np.where(one.speed == 0, 0.5, 0.0)[:, None] * (1.0, 0.0)
+    assert len(np.unique(one.agent[one.speed == 0])) == 1
+    assert same_vehicles(one, dataclasses.replace(one, position=one.position + aside)) == len(one.ids) - 1
+
+
+@pytest.mark.parametrize("last", [90, 100])
+def test_moments_between_two_windows_are_those_of_the_nearest_one(last):
+    """Windows are eight frames apart; the second recording has them three frames later."""
+    windows = dataclasses.replace(WINDOWS, every=4)
+    cuts = {"a": cut(5, "a", 0, 159, 1), "b": cut(5, "b", 3, last, 1)}
+    tables = {name: extract(of.recording, windows)[0] for name, of in cuts.items()}
+    drives = {name: Drives.of(_raw(of.recording)) for name, of in cuts.items()}
+    kept, _ = used_once({"train": ["a", "b"], "val": [], "test": []}, tables, drives, windows)
+    assert kept["a"].all()
+    assert len(kept["b"]) > 5
+    assert kept["b"].mean() < 0.5

@@ -119,6 +119,11 @@ def test_settings_that_cannot_be_are_refused(folder, key, value, message):
         data(folder, **{key: value})
 
 
+def test_a_file_in_the_place_of_the_folder_is_named(folder):
+    with pytest.raises(ConfigError, match=r"a-0\.avenue is a file: data\.folder takes the folder that it lies in"):
+        data(folder / "a-0.avenue").sources()
+
+
 def test_the_table_of_recordings_has_their_seconds_and_agents(folder):
     with (data(folder).generate(workers=1, progress=False) / summary.FILE).open(newline="") as text:
         rows = list(csv.DictReader(text))

@@ -55,6 +55,15 @@ def test_without_a_number_of_lanes_a_scene_has_those_on_which_its_agents_may_be_
         assert set(lanes[lanes >= 0].tolist()) == set(np.flatnonzero(away <= far + BEYOND).tolist())
 
 
+@pytest.mark.parametrize(("dt", "horizon"), [(0.1, 20), (0.2, 20), (0.4, 10)])
+def test_goals_of_scenes_of_ones_own_lie_within_the_time_of_the_settings(dt, horizon):
+    make = RoadScenes(recording().lanes, WindowConfig(dt=dt, horizon=horizon))
+    history = np.repeat([[[[100.0, 0.0, 0.0, 15.0]]]], 10, 2)
+    goals = make(history, np.full((1, 1, 2), 2.0)).goal_candidates[0, 0, 20:40, 0]
+    (near,), (far,) = reach(np.array([15.0]), dt * horizon)
+    torch.testing.assert_close(goals[[0, -1]].double(), torch.tensor([near, far]), rtol=0, atol=1e-3)
+
+
 def test_a_jump_aside_that_smoothing_removes_is_no_lane_change():
     """One frame is wrong by six metres: without later frames, the vehicle seems to be on the lane beside."""
     of = recording(vehicles=THREE)
