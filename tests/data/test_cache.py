@@ -249,3 +249,34 @@ def test_a_script_that_its_worker_runs_again_is_refused_instead_of_waiting_for_i
     monkeypatch.setattr(multiprocessing.current_process(), "_inheriting", True, raising=False)
     with pytest.raises(RuntimeError, match="__main__"):
         cache.make_once(tmp_path / "set", lambda: None)
+
+
+def test_an_empty_name_of_the_root_in_the_environment_is_none(monkeypatch):
+    monkeypatch.setenv("EPO_CACHE", "")
+    assert str(cache.default_root()) == "cache"
+
+
+@pytest.mark.parametrize(
+    ("number", "advice"),
+    [
+        *((number, "set data.root to a folder that can be written") for number in (errno.EACCES, errno.EROFS)),
+        *((number, "make room, or set data.root to another folder") for number in (errno.ENOSPC, errno.EDQUOT)),
+    ],
+)
+def test_the_advice_fits_the_reason_for_which_nothing_can_be_written(tmp_path, number, advice):
+    with pytest.raises(OSError, match=advice) as error, cache.writing(tmp_path / "a"):
+        raise OSError(number, os.strerror(number))
+    assert error.value.errno == number
+
+
+def test_a_manifest_names_the_versions_that_made_the_data_set(folder):
+    assert cache.manifest(folder)["packages"] == cache.versions()
+    assert {"python", "torch", "numpy"} <= cache.versions().keys()
+
+
+def test_a_data_set_that_was_renamed_is_not_found_in_the_cache(tmp_path):
+    config = {"seed": 1}
+    made = cache.write(tmp_path / f"rpi-{cache.digest(config)[:12]}", {"val": {"a": torch.zeros(1)}}, config, {})
+    assert cache.configs(tmp_path, "rpi") == [(made, config)]
+    made.rename(tmp_path / "rpi-copy")
+    assert not cache.configs(tmp_path, "rpi")

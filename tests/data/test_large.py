@@ -151,3 +151,12 @@ def test_a_small_split_is_shuffled_as_a_whole(columns):
     assert data.block is None
     order = torch.cat(list(BatchSampler(data, 1, shuffle=True, seed=5)))
     assert torch.equal(order, torch.randperm(len(data), generator=epoch_generator(5, 0)))
+
+
+@pytest.mark.usefixtures("large")
+def test_a_large_file_of_which_some_columns_were_read_is_not_known_to_be_finite(tmp_path, columns):
+    columns["centre"][5, 1] = torch.inf
+    folder = written(tmp_path, columns)
+    cache.load(folder, "train", ("direction",))
+    with pytest.raises(cache.CacheError, match="'centre' is not finite in 1 records"):
+        cache.load(folder, "train")

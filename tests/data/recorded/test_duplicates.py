@@ -306,3 +306,22 @@ def test_moments_between_two_windows_are_those_of_the_nearest_one(last):
     assert kept["a"].all()
     assert len(kept["b"]) > 5
     assert kept["b"].mean() < 0.5
+
+
+@pytest.mark.parametrize(("frames", "same"), [(39, 1), (38, 0)])
+def test_twenty_runs_of_twenty_frames_show_an_overlap(frames, same):
+    time = np.arange(120) / RATE
+    speed = np.round(8 + 3 * np.sin(time), 4)
+    place = np.stack([speed.cumsum() / RATE, np.zeros(120)], 1)
+    rows = np.arange(60), np.arange(60 - frames, 120)
+    parts = [Drives(RATE, np.zeros(len(at), int), at, place[at], speed[at], np.array([7])) for at in rows]
+    assert same_vehicles(*parts) == same
+
+
+def test_of_several_differences_of_frames_the_one_with_most_equal_runs_counts():
+    """Speeds that repeat after 60 frames agree at three differences."""
+    frame = np.arange(120)
+    speed = np.round(8 + 3 * np.sin(frame * 2 * np.pi / 60), 4)
+    place = np.stack([speed.cumsum() / RATE, np.zeros(120)], 1)
+    one = Drives(RATE, np.zeros(120, int), frame, place, speed, np.array([7]))
+    assert align([one, dataclasses.replace(one, frame=frame + 5)]).shift.tolist() == [0, -5]
