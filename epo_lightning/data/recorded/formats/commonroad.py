@@ -90,7 +90,8 @@ def _drives(path: Path) -> list[tuple[bytes, list[bytes]]]:
         raise RecordingError(path, f"the file cannot be read: {error.strerror}") from error
     drives: list[tuple[bytes, list[bytes]]] = []
     for match in re.finditer(
-        rb'<(?:dynamicO|o)bstacle\b[^<>]*\bid="(\d+)"|<velocity>\s*<exact>([^<]*)|<planningProblem', content
+        rb"<(?:dynamicO|o)bstacle\b[^<>]*\bid\s*=\s*[\"'](\d+)[\"']|<velocity>\s*<exact>([^<]*)|<planningProblem",
+        content,
     ):
         if match[1]:
             drives.append((match[1], []))

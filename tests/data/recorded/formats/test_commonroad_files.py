@@ -68,6 +68,13 @@ def test_the_fewest_speeds_that_show_the_same_vehicle(tmp_path, identity, same, 
         assert groups == (["a", "a"] if count == same else ["a", "b"])
 
 
+def test_scenes_that_overlap_are_grouped_also_with_ids_in_single_quotes(tmp_path):
+    long = speeds(0, 60)
+    for name, content in {"a": drive(1, long[:50]), "b": drive(2, long[5:])}.items():
+        (tmp_path / f"{name}.xml").write_text(scenario(content).replace('id="', "id = '").replace('">', "'>"))
+    assert [source.group for source in commonroad(tmp_path)] == ["a", "a"]
+
+
 def test_a_link_to_nowhere_is_refused_and_a_folder_is_no_scenario(tmp_path):
     (tmp_path / "a.xml").write_text(SCENARIO)
     (tmp_path / "folder.xml").mkdir()
