@@ -14,7 +14,7 @@ import torch
 
 from epo_lightning.data import cache
 from epo_lightning.data.errors import RecordingError
-from epo_lightning.data.recorded import summary
+from epo_lightning.data.recorded import parts, summary
 from epo_lightning.data.recorded.extraction import extract_to_file, outcomes
 from epo_lightning.data.recorded.recordings import RecordedData
 from epo_lightning.data.recorded.routes import LINES, PER_LINE
@@ -214,3 +214,26 @@ def test_a_split_without_scenes_repeats_the_warnings_of_its_recordings():
     assert "Warning of a: the map is odd Warning of a: the tracks are odd" in said
     assert "no more" not in said
     assert "not of this split" not in said
+
+
+@pytest.mark.parametrize(("most", "word", "count"), [(10, "recording", 5), (3, "part", 3)])
+def test_progress_counts_what_was_extracted_before(folder, monkeypatch, capsys, most, word, count):
+    monkeypatch.setattr(parts, "MOST", most)
+    module = data(folder)
+    made = parts.Parts(folder, module.sources())
+    tasks = made.tasks(module.windows, True, True, False)
+    made.extract(tasks[1:], 1, True, None)
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.partition(",")[0] for line in lines] == [
+        f"{word} {number} of {count} extracted" for number in range(2, count + 1)
+    ]
+    assert made.missing() == [0]
+
+
+def test_a_recording_that_could_not_be_read_is_read_again(folder):
+    made = parts.Parts(folder, [RecordingSource("road", "r", (), partial(changed, without_calibration))])
+    (task,) = made.tasks(WINDOWS, True, False, False)
+    extract_to_file(*task)
+    assert made.extracted()["road"].problem is not None
+    assert made.missing() == [0]
+    assert not made.files[0].exists()
