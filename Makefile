@@ -62,7 +62,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # $(1): the extras. The layer is compiled on one core while packages are downloaded and unpacked on another.
 # Without a compiler its build fails, and the layer runs in PyTorch; solvers say so when they are used.
 define INSTALL
-@$(PYTHON) -c "import sys; v = '%d.%d' % sys.version_info[:2]; sys.exit(sys.version_info < (3, 11) and '$(PYTHON) is Python ' + v + ', and 3.11 or later is needed: name another one by PYTHON=python3.12')"
+@$(PYTHON) -c "import sys; v = '%d.%d' % sys.version_info[:2]; sys.exit(sys.version_info < (3, 11) and sys.executable + ' is Python ' + v + ', and 3.11 or later is needed: name another one by PYTHON=python3.12')"
 @echo "installing into $(VENV): one to five minutes and the download, while the layer is compiled in the background ..."
 $(PYTHON) -m venv $(VENV)
 $(BIN)/pip install -q --no-compile uv || true

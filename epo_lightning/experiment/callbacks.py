@@ -54,7 +54,11 @@ class RandomStates(Callback):
         self._restored = state_dict
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Restore the states. They were stored at the end of an epoch, and this epoch has not drawn any number yet."""
+        """Restore the states. They were stored at the end of an epoch, and this epoch has not drawn any number yet.
+
+        In an uninterrupted run, the loader's iterator of this epoch is created after this call, and draws a number. In a
+        continued run, Lightning has created it already; it is created again.
+        """
         if self._restored is None:
             return
         states, self._restored = self._restored, None
@@ -65,6 +69,9 @@ class RandomStates(Callback):
         numpy.random.set_state((name, keys.numpy().astype("uint32"), position, has_gauss, gauss))  # noqa: NPY002
         version, internal, gauss_next = states["python"]
         random.setstate((version, tuple(internal), gauss_next))
+        batches = trainer.fit_loop._data_fetcher
+        assert batches is not None
+        iter(batches)
 
 
 class NextEpoch(Callback):

@@ -85,7 +85,7 @@ def _chosen(settings: EvaluateSettings) -> list[RunFolder]:
                 finished.append(run)
                 continue
             failed = run.state == "failed"
-            why = f"failed: {run.record['error']}" if failed else f"not finished (`epo train resume={run.path}`)"
+            why = f"failed: {run.record.get('error')}" if failed else f"not finished (`epo train resume={run.path}`)"
         except ConfigError as damaged:
             why = str(damaged)
         print(f"{run.path}: left out, {why}")

@@ -40,10 +40,10 @@ MISTAKES = {
         "energy.bounds.vel is read by the feature velb, which energy.own (goal, accb) does not have: add it, or leave the"
     ),
     "train experiment=dut/v_lstm_epo energy=crowd_limits energy.bounds.vel=[0,1.2]": (
-        "energy.bounds.vel is a dictionary: set one entry by energy.bounds.vel.<name>=<value>, or replace the whole by "
-        "~energy.bounds.vel +energy.bounds.vel='[0,1.2]'"
+        "energy.bounds.vel is a dictionary, not the list [0,1.2]: set one of its entries by energy.bounds.vel.<name>=<value>"
     ),
-    "train energy.bounds.vel={a:1}": "replace it by ~energy.bounds.vel +energy.bounds.vel='{a:1}'",
+    "train energy.bounds.vel={a:1}": "energy.bounds.vel is a list, not the dictionary {a:1}: set it by energy.bounds.vel=[...]",
+    "train ++energy.own={a:1}": "energy.own is a list, not the dictionary {a:1}: set it by energy.own=[...]",
     "train seed=one": "seed must be a whole number",
     "train optimizer.lr=fast": "optimizer.lr must be a number",
     "train forecaster.modes=1.5": "forecaster.modes must be a whole number",

@@ -83,6 +83,8 @@ def test_a_run_that_is_scored_from_another_folder_says_where_its_data_are(
     )
     shutil.copytree(tmp_path / "run", tmp_path / "runs" / "third")
     (tmp_path / "runs" / "third" / "run.json").write_text('{"status": "fin')
+    shutil.copytree(tmp_path / "run", tmp_path / "runs" / "fourth")
+    (tmp_path / "runs" / "fourth" / "run.json").write_text('{"status": "failed"}')
     monkeypatch.setenv("EPO_CACHE", str(tmp_path / "cache"))
     with pytest.warns(UserWarning, match="there is no folder data/ucy"):
         assert epo("evaluate", f"run={tmp_path / 'run'}") == 0
@@ -93,4 +95,5 @@ def test_a_run_that_is_scored_from_another_folder_says_where_its_data_are(
     assert f"{tmp_path / 'runs' / 'first'}: left out, " in printed
     assert f"{tmp_path / 'runs' / 'second'} (test): minADE" in printed
     assert f"{tmp_path / 'runs' / 'third'}: left out, " in printed
+    assert f"{tmp_path / 'runs' / 'fourth'}: left out, failed: None" in printed
     assert "run.json" in printed.partition("third: left out, ")[2].partition("\n")[0]

@@ -147,6 +147,18 @@ def test_a_run_that_had_stopped_early_makes_no_further_step(epo: Epo) -> None:
     assert same("whole", "parts")
 
 
+def test_a_continued_run_draws_the_random_numbers_of_an_uninterrupted_one(epo: Epo) -> None:
+    """EBIOC draws noise in every step."""
+    words = ("train", "experiment=table1/rpi_ebioc", "data=drawn", "budget=smoke", "trainer.max_epochs=3", "score=test")
+    assert epo(*words, "run_dir=whole") == 0
+    with pytest.MonkeyPatch.context() as patch:
+        stop_before_epoch(3, patch)
+        with pytest.raises(RuntimeError, match="power failure"):
+            epo(*words, "run_dir=stopped")
+    assert epo("train", "resume=stopped") == 0
+    assert same("whole", "stopped")
+
+
 @pytest.mark.parametrize("between", [2, 3, 5, 8])
 def test_a_run_that_validates_after_a_number_of_steps_goes_on_with_the_next_epoch(epo: Epo, between: int) -> None:
     """Epochs of four steps: validations are at their ends, or not, or at some of them."""

@@ -110,10 +110,10 @@ def _in_file(message: str) -> str:
 
 def _other_kind(key: str, value: str) -> str:
     """The error message for a list in the place of a dictionary, or a dictionary in the place of a list."""
-    replaced = f"~{key} +{key}='{value}'"
+    key = key.lstrip("+")
     if value.startswith("["):
-        return f"{key} is a dictionary: set one entry by {key}.<name>=<value>, or replace the whole by {replaced}"
-    return f"{key} is a list, which cannot become the dictionary {value} in one word: replace it by {replaced}"
+        return f"{key} is a dictionary, not the list {value}: set one of its entries by {key}.<name>=<value>"
+    return f"{key} is a list, not the dictionary {value}: set it by {key}=[...]"
 
 
 def _chosen(overrides: Sequence[str]) -> str:

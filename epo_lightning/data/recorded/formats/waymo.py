@@ -79,7 +79,7 @@ def waymo(folder: Path) -> list[RecordingSource]:
     """
     folder = Path(folder)
     # Links to nowhere are kept: a shard that is not there must not be left out in silence.
-    shards = sorted(path for path in folder.rglob("[!.]*tfrecord*") if not path.is_dir())
+    shards = sorted(path for path in folder.rglob("*tfrecord*") if path.name[0] != "." and not path.is_dir())
     if not shards:
         raise RecordingError(folder, "there is no shard in it: files called *.tfrecord-00000-of-01000 were expected")
     homes = {shard: _home(folder, shard) for shard in shards}
