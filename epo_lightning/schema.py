@@ -93,7 +93,7 @@ def describe(hint: Any) -> str:
     base = origin or hint
     if isinstance(base, type) and issubclass(base, Mapping):
         named = len(arguments) == 2 and arguments[1] is not Any
-        return "a mapping" + (f" with {describe(arguments[1])} for every name" if named else "")
+        return "a mapping" + (f" of names to {describe(arguments[1])}" if named else "")
     if isinstance(base, type) and issubclass(base, Sequence):
         if arguments and typing.get_origin(arguments[0]) is Literal:
             return "a list with any of " + ", ".join(map(str, typing.get_args(arguments[0])))

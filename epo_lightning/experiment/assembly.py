@@ -32,7 +32,7 @@ from epo_lightning.experiment.config.settings import PARTS, Settings, TrainerSet
 from epo_lightning.experiment.dashboards import mlflow
 from epo_lightning.forecasters import SUPPLIED, Forecaster, build_forecaster
 from epo_lightning.game.features import OWN_FEATURES
-from epo_lightning.metrics.forecast import scores
+from epo_lightning.metrics.forecast import EQUILIBRIUM_METRICS, PAIR_METRICS, scores
 from epo_lightning.registry import ConfigError, nearest
 from epo_lightning.run_folder import RunFolder
 from epo_lightning.schema import check_part
@@ -150,7 +150,8 @@ def check_monitor(monitor: str, task: Task) -> None:
     Raises:
         ConfigError: an unknown name, with the nearest known one.
     """
-    known = [f"val/{prefix}{name}" for prefix in ("", *(f"{subset}/" for subset in task.subsets)) for name in scores()]
+    names = [name for name in scores() if name not in (*EQUILIBRIUM_METRICS, *PAIR_METRICS)]  # these are of tests only
+    known = [f"val/{prefix}{name}" for prefix in ("", *(f"{subset}/" for subset in task.subsets)) for name in names]
     if monitor not in known and not monitor.startswith("train/"):
         raise ConfigError(f"unknown callbacks.monitor {monitor!r}: {nearest(monitor, known)}")
 

@@ -9,6 +9,7 @@ import random
 import socket
 import sys
 import time
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from epo_lightning.experiment.config.settings import CallbackSettings
 from epo_lightning.files import write_json
 from epo_lightning.forecasters.step_means import StepMeans
 from epo_lightning.registry import ConfigError, nearest
+from epo_lightning.report.columns import is_own
 from epo_lightning.run_folder import RunFolder
 
 
@@ -99,8 +101,8 @@ class ModelCheckpoint(of_lightning.ModelCheckpoint):
     """Lightning's ModelCheckpoint, whose stored paths follow a run folder that was moved."""
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        _require_logged(self.monitor, trainer)
-        super().on_validation_end(trainer, pl_module)
+        if _decides(self.monitor, trainer, pl_module):
+            super().on_validation_end(trainer, pl_module)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         def here(path: str) -> str:
@@ -154,25 +156,35 @@ class EarlyStopping(of_lightning.EarlyStopping):
     """Lightning's EarlyStopping, which also stops a continued run that had run out of patience before it was killed."""
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        _require_logged(self.monitor, trainer)
-        super().on_validation_end(trainer, pl_module)
+        if _decides(self.monitor, trainer, pl_module):
+            super().on_validation_end(trainer, pl_module)
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         trainer.should_stop = trainer.should_stop or self.wait_count >= self.patience
 
 
-def _require_logged(monitor: str | None, trainer: Trainer) -> None:
-    """Refuse a monitored score that this forecaster does not log.
+def _decides(monitor: str | None, trainer: Trainer, module: LightningModule) -> bool:
+    """Whether a validation has a value of the monitored score; a metric of the user may have none in any scene.
 
     Raises:
-        ConfigError: the message names the scores that it does log.
+        ConfigError: the forecaster does not log this score; the message names those that it logs.
     """
-    if trainer.sanity_checking:
-        return  # the first batch may have no scene with this score
-    if monitor is not None and monitor not in trainer.callback_metrics:
+    if monitor is None or trainer.sanity_checking:
+        return True
+    if is_own(monitor) and _without_value(monitor, module):
+        warnings.warn(f"callbacks.monitor={monitor} has no value in a validation, which is left out", stacklevel=2)
+        return False
+    if monitor not in trainer.callback_metrics:
         raise ConfigError(
             f"callbacks.monitor={monitor} is not logged by this forecaster: {nearest(monitor, trainer.callback_metrics)}"
         )
+    return True
+
+
+def _without_value(monitor: str, module: LightningModule) -> bool:
+    """Whether a metric of the user had no value in the last validation, of which Lightning keeps an earlier value."""
+    scored: frozenset[str] = module.scored  # type: ignore[assignment]
+    return monitor not in scored
 
 
 class EpochLines(Callback):
@@ -201,7 +213,8 @@ class EpochLines(Callback):
             return
         self._validated = False
         metrics = trainer.callback_metrics
-        value = float(metrics.get(self._monitor, math.nan))
+        lost = is_own(self._monitor) and _without_value(self._monitor, pl_module)
+        value = math.nan if lost else float(metrics.get(self._monitor, math.nan))
         self._best = min(self._best, value) if not math.isnan(value) else self._best
         means: StepMeans = pl_module.step_means  # type: ignore[assignment]
         loss = float(means.means().get("train/loss", math.nan))

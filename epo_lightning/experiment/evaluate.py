@@ -25,7 +25,8 @@ from epo_lightning.experiment.other_data import OtherData, open_other
 from epo_lightning.experiment.truth import TruthTest
 from epo_lightning.files import read_json, write_json
 from epo_lightning.metrics import ForecastMetrics
-from epo_lightning.registry import ConfigError
+from epo_lightning.metrics.forecast import OWN
+from epo_lightning.registry import ConfigError, parts
 from epo_lightning.report.columns import TRUE, is_own
 from epo_lightning.run_folder import OTHER, RunFolder, discover, numbered
 from epo_lightning.schema import read
@@ -275,9 +276,12 @@ def _complete(file: Path, scored: Mapping[str, Any]) -> None:
     """Add scores that a file lacks; registered metrics get their new values, because their code is the user's."""
     stored = read_json(file)
     completed: dict[str, Any] = {**scored, **stored}
+    registered = tuple(OWN + name for name in parts("metric"))
     for section in (name for name in SECTIONS if name in completed):
         own = {name: value for name, value in scored.get(section, {}).items() if is_own(name)}
-        completed[section] = {**scored.get(section, {}), **stored.get(section, {}), **own}
+        # A metric that is registered now and has no value has lost its earlier one.
+        kept = {name: value for name, value in stored.get(section, {}).items() if not name.endswith(registered)}
+        completed[section] = {**scored.get(section, {}), **kept, **own}
     if completed != stored:
         write_json(file, completed)
 

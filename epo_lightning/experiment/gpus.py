@@ -18,6 +18,7 @@ from typing import Literal
 import torch
 
 from epo_lightning.experiment.config.settings import TrainerSettings
+from epo_lightning.registry import ConfigError
 
 
 def accelerator(settings: TrainerSettings) -> Literal["cpu", "cuda"]:
@@ -28,6 +29,19 @@ def accelerator(settings: TrainerSettings) -> Literal["cpu", "cuda"]:
     if settings.accelerator == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
     return "cpu" if settings.accelerator == "cpu" else "cuda"
+
+
+def check_machine(settings: TrainerSettings) -> None:
+    """Refuse a GPU where PyTorch finds none.
+
+    Raises:
+        ConfigError: see above.
+    """
+    if accelerator(settings) == "cuda" and not torch.cuda.is_available():
+        raise ConfigError(
+            f"trainer.accelerator={settings.accelerator}, but PyTorch finds no GPU of CUDA on this machine: "
+            "trainer.accelerator=cpu works everywhere"
+        )
 
 
 @contextmanager

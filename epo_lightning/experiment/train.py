@@ -23,6 +23,7 @@ from epo_lightning.experiment.provenance import commit, of_other_code, versions
 from epo_lightning.forecasters.checkpoint import read_checkpoint
 from epo_lightning.identity import check_unchanged, differences, identity, row_identity
 from epo_lightning.registry import ConfigError
+from epo_lightning.report.columns import is_own
 from epo_lightning.run_folder import FAILED, FINISHED, TRAINING, RunFolder
 from epo_lightning.schema import read
 
@@ -64,6 +65,8 @@ def train(config: dict[str, Any], overrides: Sequence[str] = (), begun: RunFolde
     seed_everything(settings.seed, workers=True, verbose=False)
     data, forecaster = assembly.build(settings, overrides)
     step_graph.check_machine(settings)
+    if begun is None:
+        gpus.check_machine(settings.trainer)
     run = begun or folder_for(settings)
     if settings.trainer.devices > 1 and follower.trained_as_follower(settings.trainer.devices, run):
         return run
@@ -236,6 +239,11 @@ def _best_score(run: RunFolder, trainer: Trainer, monitor: str) -> float:
     watchers = [w for w in trainer.checkpoint_callbacks if isinstance(w, callbacks.ModelCheckpoint) and w.monitor]
     best = [w.best_model_score for w in watchers]
     score = next((float(value) for value in best if value is not None), None)
+    if score is None and is_own(monitor):
+        raise ConfigError(
+            f"{run.path}: no validation has a value of callbacks.monitor={monitor}, so there is no best checkpoint: monitor "
+            "another score"
+        )
     if score is None and monitor not in trainer.callback_metrics:
         raise ConfigError(
             f"{run.path}: the training ended after {trainer.global_step} steps, before its first validation: validate more "

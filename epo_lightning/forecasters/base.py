@@ -59,6 +59,8 @@ class Forecaster(LightningModule):
         self.task = task
         self.optimizer = optimizer
         self.step_means = StepMeans()
+        self.scored: frozenset[str] = frozenset()
+        """Names of the scores of the last validation or test; a registered metric may have no value in any scene."""
         self.val_metrics = ForecastMetrics(task.subsets, task.shape)
         self.test_metrics = ForecastMetrics(task.subsets, task.shape)
 
@@ -178,7 +180,9 @@ class Forecaster(LightningModule):
 
     def _log_metrics(self, split: str, metrics: ForecastMetrics) -> None:
         scores = metrics.compute()
-        self.log_dict({f"{split}/{name}": value for name, value in scores.items()})
+        named = {f"{split}/{name}": value for name, value in scores.items()}
+        self.scored = frozenset(named)
+        self.log_dict(named)
         if split == "test" and STOPPED in scores:
             _warn_of_stopped(float(scores[STOPPED]), int(metrics.count[0, COLUMNS.index(STOPPED)]))
         metrics.reset()

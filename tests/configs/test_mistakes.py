@@ -42,8 +42,12 @@ MISTAKES = {
     "train experiment=dut/v_lstm_epo energy=crowd_limits energy.bounds.vel=[0,1.2]": (
         "energy.bounds.vel is a dictionary, not the list [0,1.2]: set one of its entries by energy.bounds.vel.<name>=<value>"
     ),
-    "train energy.bounds.vel={a:1}": "energy.bounds.vel is a list, not the dictionary {a:1}: set it by energy.bounds.vel=[...]",
+    "train energy.bounds.vel={a:1}": "energy.bounds.vel is a list, not the dictionary {a:1}: set it by",
     "train ++energy.own={a:1}": "energy.own is a list, not the dictionary {a:1}: set it by energy.own=[...]",
+    "train lr=3e-4": "unknown key 'lr': it is optimizer.lr",
+    "train energy.own.goal=1": "energy.own.goal=1 names an entry of a list, whose entries have numbers: set the whole list",
+    "train callbacks.monitor=val/nash_gap": "unknown callbacks.monitor 'val/nash_gap'",
+    "train energy.bounds.vel=1.2": "energy.bounds must be a mapping of names to a list of numbers or a mapping",
     "train seed=one": "seed must be a whole number",
     "train optimizer.lr=fast": "optimizer.lr must be a number",
     "train forecaster.modes=1.5": "forecaster.modes must be a whole number",

@@ -111,3 +111,70 @@ def test_a_monitored_score_may_be_missing_in_the_first_validated_batch(
     assert epo("train", *words, "callbacks.monitor=val/own/late", "run_dir=runs/late") == 0
     assert len(calls) > 2
     assert json.loads((tmp_path / "runs" / "late" / "run.json").read_text())["best"]["val/own/late"] > 0
+
+
+def test_a_monitored_metric_without_a_value_decides_nothing_also_after_a_stop(
+    epo: Epo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The metric has values in the first validation only; a run that is stopped after it ends as one that is not."""
+
+    def early(forecast: JointForecast, scene: Scene) -> Tensor:
+        speed = top_speed(forecast, scene)
+        return speed if epoch[0] == 0 else speed * float("nan")
+
+    def begin(self: Forecaster) -> None:
+        epoch[0] = self.current_epoch
+        if epoch[0] == stop:
+            raise RuntimeError("power failure")
+        original(self)
+
+    epoch, original = [0], Forecaster.on_train_epoch_start
+    monkeypatch.setattr(registry, "_PARTS", {**registry._PARTS, "metric": {"early": early}})
+    monkeypatch.setattr(Forecaster, "on_train_epoch_start", begin)
+    words = (
+        "experiment=rpi/v_lstm_sc",
+        "data=drawn",
+        "budget=smoke",
+        "callbacks.progress=lines",
+        "trainer.max_epochs=3",
+    )
+    monitor = "callbacks.monitor=val/own/early"
+    stop = -1
+    with pytest.warns(UserWarning, match="val/own/early has no value in a validation"):
+        assert epo("train", *words, monitor, "run_dir=runs/whole") == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if "epoch" in line]
+    assert ["val/own/early nan" in line for line in lines] == [False, True, True]
+    stop, epoch[0] = 1, 0
+    with pytest.raises(RuntimeError, match="power failure"):
+        epo("train", *words, monitor, "run_dir=runs/parts")
+    stop = -1
+    with pytest.warns(UserWarning, match="val/own/early has no value in a validation"):
+        assert epo("train", "resume=runs/parts") == 0
+    records = [json.loads((tmp_path / "runs" / name / "run.json").read_text()) for name in ("whole", "parts")]
+    assert records[0]["best"] == records[1]["best"]
+
+
+def test_a_metric_that_has_no_value_any_more_loses_its_earlier_one(
+    epo: Epo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def own(**metrics: Callable[[JointForecast, Scene], Tensor]) -> None:
+        monkeypatch.setattr(registry, "_PARTS", {**registry._PARTS, "metric": metrics})
+
+    own(speed=top_speed, gone=top_speed)
+    words = ("experiment=rpi/const_vel", "data=drawn", "budget=smoke", "callbacks.progress=none", "score=test")
+    assert epo("train", *words, "run_dir=runs/one") == 0
+    own(speed=lambda forecast, scene: top_speed(forecast, scene) * float("nan"))
+    assert epo("evaluate", "run=runs/one") == 0
+    found = json.loads((tmp_path / "runs" / "one" / "metrics.json").read_text())["metrics"]
+    assert {name for name in found if "own/" in name} == {"own/gone", "executed/own/gone", "alternative/own/gone"}
+
+
+def test_a_monitored_metric_without_any_value_is_named(
+    epo: Epo, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    never = {"never": lambda forecast, scene: top_speed(forecast, scene) * float("nan")}
+    monkeypatch.setattr(registry, "_PARTS", {**registry._PARTS, "metric": never})
+    words = ("experiment=rpi/v_lstm_sc", "data=drawn", "budget=smoke", "callbacks.progress=none")
+    with pytest.warns(UserWarning, match="has no value in a validation"):
+        assert epo("train", *words, "callbacks.monitor=val/own/never", "run_dir=runs/never") == 2
+    assert "no validation has a value of callbacks.monitor=val/own/never" in capsys.readouterr().err

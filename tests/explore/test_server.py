@@ -69,8 +69,8 @@ def test_questions_are_answered_and_mistakes_named(address: str) -> None:
         ({"scnee": 1}, "unknown key scnee: did you mean 'scene'"),
         ({"scene": "first"}, "scene must be"),
         ({"scene": 99}, "scene must be a number from 0 to 15"),
-        ({"goals": {"0": ["a", "b"]}}, "goals must be a mapping with a list of numbers for every name"),
-        ({"factors": {"goal": None}}, "factors must be a mapping with a number for every name"),
+        ({"goals": {"0": ["a", "b"]}}, "goals must be a mapping of names to a list of numbers"),
+        ({"factors": {"goal": None}}, "factors must be a mapping of names to a number"),
         (["x" * 10**6], "must be an object"),
     ):
         status, answer = ask(f"{address}/solve", body)

@@ -73,6 +73,12 @@ def one_sentence(instance: Hydra, name: str, overrides: Sequence[str]) -> Iterat
     except ValueError as error:  # Hydra's own, for example debug=null
         if isinstance(error, ConfigError):
             raise
+        if index := re.search(r"invalid literal for int\(\) with base 10: '(.+)'", str(error)):
+            word = next((word for word in overrides if f".{index.group(1)}" in word.partition("=")[0]), index.group(1))
+            raise ConfigError(
+                f"{word} names an entry of a list, whose entries have numbers: set the whole list, as in "
+                "energy.own=[goal,vel]"
+            ) from error
         raise ConfigError(sentence(error)) from error
 
 
@@ -234,11 +240,12 @@ def _unknown_key(instance: Hydra, name: str, key: str, overrides: Sequence[str])
             return f"unknown key {key!r}: {nearest(below[0], known)}"
         if word not in names and names and word in _settings_in(walked, whole):
             return f"{key} is a setting that the chosen file of {walked[0]} leaves at its default: set it by +{key}=<value>"
-        if word not in names and walked:
-            place = ".".join(walked)
+        if word not in names:
+            place = ".".join([*walked, ""])
             inner = [name for name in names if isinstance(config[name], DictConfig) and word in config[name]]
             if len(inner) == 1:
-                return f"unknown key {key!r} in {place}: it is {place}.{inner[0]}.{word}"
+                level = f" in {'.'.join(walked)}" if walked else ""
+                return f"unknown key {key!r}{level}: it is {place}{inner[0]}.{word}"
         if word not in names:
             if not walked and word != "hydra":  # groups whose options have no section of their own, such as experiment
                 defaults = instance.config_loader.compute_defaults_list(name, overrides=[], run_mode=RunMode.RUN)
