@@ -295,6 +295,8 @@ def naming(settings: TrainerSettings, run: RunFolder) -> Iterator[None]:
     """
     try:
         yield
+    except ConfigError:
+        raise
     except (MisconfigurationException, ValueError, RuntimeError) as error:
         raise ConfigError(
             f"this machine has no device for trainer.accelerator={settings.accelerator}, trainer.precision="

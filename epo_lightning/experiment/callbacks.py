@@ -101,7 +101,7 @@ class ModelCheckpoint(of_lightning.ModelCheckpoint):
     """Lightning's ModelCheckpoint, whose stored paths follow a run folder that was moved."""
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if _decides(self.monitor, trainer, pl_module):
+        if trainer.sanity_checking or _decides(self.monitor, trainer, pl_module):
             super().on_validation_end(trainer, pl_module)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -156,7 +156,7 @@ class EarlyStopping(of_lightning.EarlyStopping):
     """Lightning's EarlyStopping, which also stops a continued run that had run out of patience before it was killed."""
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if _decides(self.monitor, trainer, pl_module):
+        if trainer.sanity_checking or _decides(self.monitor, trainer, pl_module):
             super().on_validation_end(trainer, pl_module)
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -169,7 +169,7 @@ def _decides(monitor: str | None, trainer: Trainer, module: LightningModule) -> 
     Raises:
         ConfigError: the forecaster does not log this score; the message names those that it logs.
     """
-    if monitor is None or trainer.sanity_checking:
+    if monitor is None:
         return True
     if is_own(monitor) and _without_value(monitor, module):
         warnings.warn(f"callbacks.monitor={monitor} has no value in a validation, which is left out", stacklevel=2)

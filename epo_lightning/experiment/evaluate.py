@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -170,7 +171,7 @@ def _test(
     double = of_run.trainer.precision == "64-true"
     with assembly.naming(machine, run):
         trainer = Trainer(
-            accelerator=gpus.accelerator(machine),
+            accelerator=gpus.accelerator(replace(machine, graph=False)),  # graphs are of training steps
             devices=devices if machine.devices == 1 else 1,
             precision=None if double else of_run.trainer.precision,  # type: ignore[arg-type]
             plugins=[assembly.Double()] if double else None,

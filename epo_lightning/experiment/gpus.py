@@ -25,23 +25,20 @@ def accelerator(settings: TrainerSettings) -> Literal["cpu", "cuda"]:
     """Name of the accelerator that Lightning's Trainer gets.
 
     GPUs are those of CUDA. Apple's, which Lightning would take as well, have no float64, in which scores are summed.
-    """
-    if settings.accelerator == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    return "cpu" if settings.accelerator == "cpu" else "cuda"
-
-
-def check_machine(settings: TrainerSettings) -> None:
-    """Refuse a GPU where PyTorch finds none.
 
     Raises:
-        ConfigError: see above.
+        ConfigError: a GPU or a CUDA graph is wanted, and PyTorch sees no CUDA device.
     """
-    if accelerator(settings) == "cuda" and not torch.cuda.is_available():
+    if torch.cuda.is_available():
+        return "cpu" if settings.accelerator == "cpu" else "cuda"
+    if settings.accelerator == "gpu":
         raise ConfigError(
-            f"trainer.accelerator={settings.accelerator}, but PyTorch finds no GPU of CUDA on this machine: "
-            "trainer.accelerator=cpu works everywhere"
+            "trainer.accelerator=gpu needs a CUDA device, and PyTorch sees none here: set trainer.accelerator=cpu, "
+            "for a run that has begun in its config.yaml"
         )
+    if settings.graph:
+        raise ConfigError("trainer.graph=true needs a CUDA device, and PyTorch sees none here: set trainer.graph=false")
+    return "cpu"
 
 
 @contextmanager
@@ -52,7 +49,7 @@ def placed(settings: TrainerSettings) -> Iterator[int | list[int]]:
         the argument ``devices`` of Lightning's Trainer: the index of that GPU in a list, or a number of devices for runs on
         a CPU or on several devices.
     """
-    if accelerator(settings) == "cpu" or settings.devices > 1 or not torch.cuda.is_available():
+    if settings.accelerator == "cpu" or settings.devices > 1 or not torch.cuda.is_available():
         yield settings.devices
         return
     count = torch.cuda.device_count()

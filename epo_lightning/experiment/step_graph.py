@@ -217,13 +217,3 @@ def check(settings: Settings, forecaster: Forecaster) -> None:
             "trainer.graph=false, or use levenberg_marquardt with solver.backend=pytorch, or with solver.backend=warp "
             "(pip install 'epo_lightning[gpu]') and solver.adaptive=false"
         )
-
-
-def check_machine(settings: Settings) -> None:
-    """Refuse ``trainer.graph`` on a machine without a CUDA device.
-
-    Raises:
-        ConfigError: PyTorch sees none.
-    """
-    if settings.trainer.graph and not torch.cuda.is_available():
-        raise ConfigError("trainer.graph=true needs a CUDA device, and PyTorch sees none here: set trainer.graph=false")

@@ -64,9 +64,7 @@ def train(config: dict[str, Any], overrides: Sequence[str] = (), begun: RunFolde
     settings = read(Settings, config)
     seed_everything(settings.seed, workers=True, verbose=False)
     data, forecaster = assembly.build(settings, overrides)
-    step_graph.check_machine(settings)
-    if begun is None:
-        gpus.check_machine(settings.trainer)
+    gpus.accelerator(settings.trainer)  # raises an error for a missing GPU before a run folder is made
     run = begun or folder_for(settings)
     if settings.trainer.devices > 1 and follower.trained_as_follower(settings.trainer.devices, run):
         return run

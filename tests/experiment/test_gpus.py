@@ -63,10 +63,13 @@ def test_gpus_are_those_of_cuda(cuda: bool, tmp_path: Path, monkeypatch: pytest.
     """Lightning would also take Apple's, which cannot sum scores in float64."""
     monkeypatch.setattr("torch.cuda.is_available", lambda: cuda)
     monkeypatch.setattr("lightning.pytorch.accelerators.mps.MPSAccelerator.is_available", lambda: True)
-    found = {name: accelerator(TrainerSettings(accelerator=name)) for name in ("cpu", "gpu", "auto")}
-    assert found == {"cpu": "cpu", "gpu": "cuda", "auto": "cuda" if cuda else "cpu"}
-    if not cuda:
-        run = RunFolder(tmp_path)
-        assert isinstance(build_trainer(TrainerSettings(accelerator="auto"), run, []).accelerator, CPUAccelerator)
-        with pytest.raises(ConfigError, match=r"no device for trainer\.accelerator=gpu"):
-            build_trainer(TrainerSettings(accelerator="gpu"), run, [])
+    assert accelerator(TrainerSettings(accelerator="cpu")) == "cpu"
+    auto = TrainerSettings(accelerator="auto")
+    if cuda:
+        assert accelerator(TrainerSettings(accelerator="gpu")) == accelerator(auto) == "cuda"
+        return
+    assert isinstance(build_trainer(auto, RunFolder(tmp_path), []).accelerator, CPUAccelerator)
+    with pytest.raises(ConfigError, match=r"trainer\.accelerator=gpu needs a CUDA device"):
+        accelerator(TrainerSettings(accelerator="gpu"))
+    with pytest.raises(ConfigError, match=r"trainer\.graph=true needs a CUDA device"):
+        accelerator(TrainerSettings(accelerator="auto", graph=True))

@@ -246,7 +246,7 @@ def test_a_missing_gpu_is_named(epo: Epo, refused: Callable[..., str]) -> None:
     RunFolder(Path("run")).metrics_file().unlink()
     assert "trainer.accelerator=gpu" in refused("evaluate", "run=run")
     said = refused(*WORSENING, "trainer.accelerator=gpu", "run_dir=other")
-    assert "trainer.accelerator=gpu, but PyTorch finds no GPU of CUDA on this machine" in said
+    assert "trainer.accelerator=gpu needs a CUDA device, and PyTorch sees none here" in said
     assert not Path("other").exists(), "nothing is left that would have to be continued"
 
 

@@ -17,7 +17,7 @@ from suites import IMITATION, LOSS_WEIGHTS, model
 from torch import nn
 from torch.utils.data import DataLoader
 
-from epo_lightning.experiment import step_graph
+from epo_lightning.experiment import gpus, step_graph
 from epo_lightning.experiment.config.settings import TrainerSettings
 from epo_lightning.experiment.step_graph import WARM_UP, StepGraph
 from epo_lightning.forecasters import Forecaster, build_forecaster
@@ -292,7 +292,7 @@ def test_a_machine_without_a_gpu_is_named(refused: Any) -> None:
 
 
 def test_a_run_with_a_graph_is_the_same_run(again, epo: Epo, tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(step_graph, "check_machine", lambda settings: None)
+    monkeypatch.setattr(gpus, "accelerator", lambda settings: "cpu")
     words = (
         "experiment=rpi/v_lstm_sc",
         "data=tiny",
