@@ -21,7 +21,7 @@ sys.path.insert(0, {site!r})
 from pathlib import Path
 from epo_lightning.solvers.gauss_newton.backends import compiled
 from epo_lightning.solvers.gauss_newton.kernel import interface
-print(Path(compiled.__file__).parents[3], interface.library().epo_levels() > 0)
+print(Path(compiled.__file__).parents[4], interface.library().epo_levels() > 0)
 """
 
 
