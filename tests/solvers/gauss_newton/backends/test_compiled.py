@@ -264,7 +264,7 @@ sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
 def test_a_forked_process_has_threads_of_its_own():
-    path = [str(Path(__file__).parents[2]), str(Path(__file__).parents[3])]
+    path = [str(Path(__file__).parents[3]), str(Path(__file__).parents[4])]
     subprocess.run([sys.executable, "-c", _FORK.format(path=path)], check=True, timeout=120)
 
 
@@ -321,7 +321,7 @@ print(interrupted, overwritten)
 @pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="no interval timers on this system")
 def test_interrupts_leave_no_thread_that_writes_to_released_memory():
     """The second interrupt comes while the first one is handled; results afterwards equal those before."""
-    path = [str(Path(__file__).parents[2]), str(Path(__file__).parents[3])]
+    path = [str(Path(__file__).parents[3]), str(Path(__file__).parents[4])]
     program = [sys.executable, "-c", _INTERRUPTS.format(path=path)]
     found = subprocess.run(program, timeout=300, capture_output=True, text=True)
     assert found.returncode == 0, found.stderr
@@ -378,7 +378,7 @@ except MemoryError as error:
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="limits the memory as Linux does")
 def test_too_little_memory_is_an_exception():
     """Sixty-four agents that all touch leave 170 MB of factors per step."""
-    path = [str(Path(__file__).parents[2]), str(Path(__file__).parents[3])]
+    path = [str(Path(__file__).parents[3]), str(Path(__file__).parents[4])]
     program = [sys.executable, "-c", _SHORT_OF_MEMORY.format(path=path)]
     found = subprocess.run(program, check=True, timeout=120, capture_output=True, text=True)
     assert "fewer scenes or modes at a time" in found.stdout
