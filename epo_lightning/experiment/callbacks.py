@@ -171,7 +171,7 @@ def _decides(monitor: str | None, trainer: Trainer, module: LightningModule) -> 
     """
     if monitor is None:
         return True
-    if is_own(monitor) and _without_value(monitor, module):
+    if _without_value(monitor, module):
         warnings.warn(f"callbacks.monitor={monitor} has no value in a validation, which is left out", stacklevel=2)
         return False
     if monitor not in trainer.callback_metrics:
@@ -182,9 +182,8 @@ def _decides(monitor: str | None, trainer: Trainer, module: LightningModule) -> 
 
 
 def _without_value(monitor: str, module: LightningModule) -> bool:
-    """Whether a metric of the user had no value in the last validation, of which Lightning keeps an earlier value."""
-    scored: frozenset[str] = module.scored  # type: ignore[assignment]
-    return monitor not in scored
+    """Whether a score is a metric of the user that had no value in the last validation; Lightning keeps an earlier one."""
+    return is_own(monitor) and monitor not in module.scored  # type: ignore[operator]
 
 
 class EpochLines(Callback):
@@ -213,7 +212,7 @@ class EpochLines(Callback):
             return
         self._validated = False
         metrics = trainer.callback_metrics
-        lost = is_own(self._monitor) and _without_value(self._monitor, pl_module)
+        lost = _without_value(self._monitor, pl_module)
         value = math.nan if lost else float(metrics.get(self._monitor, math.nan))
         self._best = min(self._best, value) if not math.isnan(value) else self._best
         means: StepMeans = pl_module.step_means  # type: ignore[assignment]

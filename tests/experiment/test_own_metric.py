@@ -21,17 +21,23 @@ def top_speed(forecast: JointForecast, scene: Scene) -> Tensor:
     return forecast.states[..., 3].flatten(1).amax(1)
 
 
+@pytest.fixture
+def own(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Registers metrics by name in the place of all others, until the end of the test."""
+    return lambda **metrics: monkeypatch.setattr(registry, "_PARTS", {**registry._PARTS, "metric": metrics})
+
+
 def table_of(report: Path) -> str:
     """The table of further metrics in a report."""
     return (report / "results.md").read_text().partition("further metrics\n\n")[2].partition("\n\n")[0]
 
 
 def test_older_runs_get_the_metric_when_they_are_evaluated_again(
-    epo: Epo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    epo: Epo, tmp_path: Path, own: Callable[..., None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ("data=drawn", "budget=smoke", "callbacks.progress=none", "score=test", "seed=0")
     assert epo("train", "experiment=rpi/const_vel", *words) == 0
-    monkeypatch.setattr(registry, "_PARTS", {**registry._PARTS, "metric": {"top speed": top_speed}})
+    own(**{"top speed": top_speed})
     assert epo("train", "experiment=rpi/v_lstm_sc", *words, "callbacks.monitor=val/own/top speed") == 0
     assert epo("report", "runs=runs", "out=before") == 0
     before = table_of(tmp_path / "before")
@@ -48,12 +54,9 @@ def test_older_runs_get_the_metric_when_they_are_evaluated_again(
 
 
 def test_metrics_that_some_runs_lack_and_corrected_ones_do_not_prevent_a_report(
-    epo: Epo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    epo: Epo, tmp_path: Path, own: Callable[..., None]
 ) -> None:
     """A metric has no value for the scenes of one seed, has another name later, or another formula."""
-
-    def own(**metrics: Callable[[JointForecast, Scene], Tensor]) -> None:
-        monkeypatch.setattr(registry, "_PARTS", {**registry._PARTS, "metric": metrics})
 
     def stored(seed: int) -> dict[str, float]:
         found = json.loads((tmp_path / "runs" / f"s{seed}" / "metrics.json").read_text())["metrics"]
@@ -76,12 +79,16 @@ def test_metrics_that_some_runs_lack_and_corrected_ones_do_not_prevent_a_report(
 
 
 def test_a_metric_that_fails_is_found_before_the_first_step(
-    epo: Epo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    epo: Epo,
+    tmp_path: Path,
+    own: Callable[..., None],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     def broken(forecast: JointForecast, scene: Scene) -> Tensor:
         return forecast.speeds  # type: ignore[attr-defined,no-any-return]
 
-    monkeypatch.setattr(registry, "_PARTS", {**registry._PARTS, "metric": {"broken": broken}})
+    own(broken=broken)
     steps: list[int] = []
     monkeypatch.setattr(Forecaster, "training_step", lambda self, scene, index: steps.append(index))
     assert epo("train", "experiment=rpi/v_lstm_sc", "data=drawn", "budget=smoke", "callbacks.progress=none") == 2
@@ -90,7 +97,7 @@ def test_a_metric_that_fails_is_found_before_the_first_step(
 
 
 def test_a_monitored_score_may_be_missing_in_the_first_validated_batch(
-    epo: Epo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    epo: Epo, tmp_path: Path, own: Callable[..., None]
 ) -> None:
     """Two batches are validated after training; the score has values in the second one only."""
     calls: list[int] = []
@@ -100,7 +107,7 @@ def test_a_monitored_score_may_be_missing_in_the_first_validated_batch(
         speed = top_speed(forecast, scene)
         return speed if len(calls) > 2 else speed * float("nan")
 
-    monkeypatch.setattr(registry, "_PARTS", {**registry._PARTS, "metric": {"late": late}})
+    own(late=late)
     words = (
         "experiment=rpi/v_lstm_sc",
         "data=drawn",
@@ -114,7 +121,11 @@ def test_a_monitored_score_may_be_missing_in_the_first_validated_batch(
 
 
 def test_a_monitored_metric_without_a_value_decides_nothing_also_after_a_stop(
-    epo: Epo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    epo: Epo,
+    tmp_path: Path,
+    own: Callable[..., None],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """The metric has values in the first validation only; a run that is stopped after it ends as one that is not."""
 
@@ -129,7 +140,7 @@ def test_a_monitored_metric_without_a_value_decides_nothing_also_after_a_stop(
         original(self)
 
     epoch, original = [0], Forecaster.on_train_epoch_start
-    monkeypatch.setattr(registry, "_PARTS", {**registry._PARTS, "metric": {"early": early}})
+    own(early=early)
     monkeypatch.setattr(Forecaster, "on_train_epoch_start", begin)
     words = (
         "experiment=rpi/v_lstm_sc",
@@ -155,11 +166,8 @@ def test_a_monitored_metric_without_a_value_decides_nothing_also_after_a_stop(
 
 
 def test_a_metric_that_has_no_value_any_more_loses_its_earlier_one(
-    epo: Epo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    epo: Epo, tmp_path: Path, own: Callable[..., None]
 ) -> None:
-    def own(**metrics: Callable[[JointForecast, Scene], Tensor]) -> None:
-        monkeypatch.setattr(registry, "_PARTS", {**registry._PARTS, "metric": metrics})
-
     own(speed=top_speed, gone=top_speed)
     words = ("experiment=rpi/const_vel", "data=drawn", "budget=smoke", "callbacks.progress=none", "score=test")
     assert epo("train", *words, "run_dir=runs/one") == 0
@@ -170,10 +178,9 @@ def test_a_metric_that_has_no_value_any_more_loses_its_earlier_one(
 
 
 def test_a_monitored_metric_without_any_value_is_named(
-    epo: Epo, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    epo: Epo, own: Callable[..., None], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    never = {"never": lambda forecast, scene: top_speed(forecast, scene) * float("nan")}
-    monkeypatch.setattr(registry, "_PARTS", {**registry._PARTS, "metric": never})
+    own(never=lambda forecast, scene: top_speed(forecast, scene) * float("nan"))
     words = ("experiment=rpi/v_lstm_sc", "data=drawn", "budget=smoke", "callbacks.progress=none")
     with pytest.warns(UserWarning, match="has no value in a validation"):
         assert epo("train", *words, "callbacks.monitor=val/own/never", "run_dir=runs/never") == 2

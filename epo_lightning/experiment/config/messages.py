@@ -241,17 +241,14 @@ def _unknown_key(instance: Hydra, name: str, key: str, overrides: Sequence[str])
         if word not in names and names and word in _settings_in(walked, whole):
             return f"{key} is a setting that the chosen file of {walked[0]} leaves at its default: set it by +{key}=<value>"
         if word not in names:
-            place = ".".join([*walked, ""])
+            level = f" in {'.'.join(walked)}" if walked else ""
             inner = [name for name in names if isinstance(config[name], DictConfig) and word in config[name]]
             if len(inner) == 1:
-                level = f" in {'.'.join(walked)}" if walked else ""
-                return f"unknown key {key!r}{level}: it is {place}{inner[0]}.{word}"
-        if word not in names:
+                return f"unknown key {key!r}{level}: it is {'.'.join([*walked, inner[0], word])}"
             if not walked and word != "hydra":  # groups whose options have no section of their own, such as experiment
                 defaults = instance.config_loader.compute_defaults_list(name, overrides=[], run_mode=RunMode.RUN)
                 groups = {str(group).partition("/")[0] for group in defaults.overrides.known_choices}
                 names = sorted({*names, *groups} - {"hydra"})
-            level = f" in {'.'.join(walked)}" if walked else ""
             return f"unknown key {key!r}{level}: {nearest(word, names)}"
         walked.append(word)
         config = config[word]
