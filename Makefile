@@ -94,7 +94,7 @@ run: $(INSTALLED)
 	$(EPO) sweep first_table runs=$(RUNS) callbacks.progress=lines hydra/launcher=local
 	$(EPO) report first_table runs=$(RUNS) out=$(OUT)
 	@echo
-	@echo "V-LSTM forecasts each agent alone, +SC all agents together, +EPO by a game that it infers. Smaller minSADE and minSFDE [m] are better."
+	@echo "V-LSTM forecasts each agent alone, +SC all agents together, +EPO by a game that it infers. Smaller SADE and SFDE [m] are better."
 	@echo "Expected in the first three rows: +EPO below +SC, and both far below V-LSTM. These rows are trained with a remedy against modes that are"
 	@echo "never taught (docs/rpi_results.md). The last two rows have no remedy: with so little training, chance decides whether all modes learn."
 	@echo "This was a tenth of the data and eight epochs. All data and twenty epochs take a quarter of an hour for each of nine runs:"

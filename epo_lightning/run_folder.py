@@ -32,6 +32,7 @@ Names of the forms ``scores-..`` and ``runtime-..`` that are taken get a number,
 from __future__ import annotations
 
 import csv
+import difflib
 import io
 import itertools
 import socket
@@ -65,6 +66,13 @@ def numbered(path: Path) -> Iterator[Path]:
         yield path.with_stem(f"{path.stem}-{number}")
 
 
+def neighbour(folder: Path) -> Path | None:
+    """The folder beside a missing one whose name is most like it; None where there is none."""
+    beside = [entry.name for entry in folder.parent.iterdir() if entry.is_dir()] if folder.parent.is_dir() else []
+    close = difflib.get_close_matches(folder.name, beside, n=1)
+    return folder.parent / close[0] if close else None
+
+
 def read_log(path: Path) -> list[dict[str, str]]:
     """The rows of a ``metrics.csv`` as text without empty entries, each with a whole number ``step``.
 
@@ -94,10 +102,12 @@ class RunFolder:
         """
         run = cls(pretrained.folder_of(path) or Path(path).expanduser())
         if not run.path.is_dir():
-            shipped = nearest(str(path), pretrained.names())
+            beside = neighbour(run.path)
             raise ConfigError(
-                f"no run folder {run.path}: the folder does not exist, and no run of that name ships with the package "
-                f"({shipped})"
+                f"no run folder {run.path}: "
+                + (f"did you mean {beside}? " if beside else "")
+                + "The folder does not exist, and no run of that name ships with the package "
+                f"({nearest(str(path), pretrained.names())})"
             )
         if not run.config_file.is_file() or not run.record_file.is_file():
             below = [str(found.path) for found in discover(run.path)]

@@ -68,6 +68,8 @@ class Report:
         )
         self.row = self.bar.add_task("", total=self.total, completed=before)
         self.begin = self.first = time.monotonic()
+        if self.lines and self.left:
+            print(f"{doing} {unit}s, {len(self.left)} to do", file=sys.stderr, flush=True)
 
     def advance(self, task: Arguments) -> None:
         """Count a finished task."""

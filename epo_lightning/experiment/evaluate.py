@@ -29,7 +29,7 @@ from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.metrics.forecast import OWN
 from epo_lightning.registry import ConfigError, parts
 from epo_lightning.report.columns import TRUE, is_own
-from epo_lightning.run_folder import OTHER, RunFolder, discover, numbered
+from epo_lightning.run_folder import OTHER, RunFolder, discover, neighbour, numbered
 from epo_lightning.schema import read
 
 SECTIONS = ("metrics", "truth")
@@ -79,6 +79,11 @@ def _chosen(settings: EvaluateSettings) -> list[RunFolder]:
     if settings.run is not None:
         return [RunFolder.open(settings.run)]
     folder = Path(str(settings.runs)).expanduser()
+    if not folder.is_dir():
+        beside = neighbour(folder)
+        raise ConfigError(
+            f"no folder {folder} of runs: " + (f"did you mean {beside}?" if beside else "it does not exist")
+        )
     found = list(discover(folder))
     finished = []
     for run in found:

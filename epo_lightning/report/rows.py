@@ -6,6 +6,7 @@ A *row* contains all runs that differ only in their seed: what the paper's table
 from __future__ import annotations
 
 import math
+import os
 import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,7 +15,7 @@ from typing import Any
 from epo_lightning.identity import differences
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.columns import GAME, is_own
-from epo_lightning.report.labels import labels, value_text, varying
+from epo_lightning.report.labels import labels, value_text, varying, word
 from epo_lightning.report.paper import interacts, is_papers, paper_values
 from epo_lightning.report.runs import EvaluatedRun
 
@@ -257,10 +258,22 @@ def require_same(runs: Iterable[EvaluatedRun], what: str, value: Callable[[Evalu
         rows = {entry: ", ".join(dict.fromkeys(run.name for run in same)) for entry, same in sorted(having.items())}
         found = "; ".join(f"{entry}: {names}" for entry, names in rows.items())
         paths = ", ".join(str(same[0].path) for _, same in sorted(having.items()))
+        apart = " or ".join(f"`epo report {word('runs', folder)}`" for folder in _folders_apart([*having.values()]))
         raise ConfigError(
-            f"rows of one table differ in {what} ({found}): report on a folder whose runs share it, "
-            f"or run the missing ones; such runs are {paths}"
+            f"rows of one table differ in {what} ({found}): report on a folder whose runs share it"
+            + (f", {apart}," if apart else ",")
+            + f" or run the missing ones; such runs are {paths}"
         )
+
+
+def _folders_apart(groups: Sequence[Sequence[EvaluatedRun]]) -> list[str]:
+    """For each group of runs the folder that holds all of them; without those that hold a run of another group as well."""
+    folders = [os.path.commonpath([run.path for run in group]) for group in groups]
+    return [
+        folder
+        for folder, group in zip(folders, groups, strict=True)
+        if not any(run.path.is_relative_to(folder) for other in groups if other is not group for run in other)
+    ]
 
 
 def _row(runs: Sequence[EvaluatedRun]) -> Row:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatch
@@ -15,7 +14,7 @@ from epo_lightning.registry import ConfigError
 from epo_lightning.report.columns import TRUE
 from epo_lightning.report.entries import NUMBERS_BY_NAME, TEXTS, check_configuration, check_known, check_record
 from epo_lightning.report.records import CONFIG, RECORD, Records
-from epo_lightning.run_folder import FINISHED, OTHER, RunFolder, discover
+from epo_lightning.run_folder import FINISHED, OTHER, RunFolder, discover, neighbour
 
 _ABOUT = {"agents": NUMBERS_BY_NAME, "notes": TEXTS}
 """Entries on the scenes of other data, which older files lack."""
@@ -93,10 +92,8 @@ def find_runs(folder: str | Path) -> list[RunFolder]:
     """
     folder = Path(folder).expanduser()
     if not folder.is_dir():
-        beside = [entry.name for entry in folder.parent.iterdir() if entry.is_dir()] if folder.parent.is_dir() else []
-        close = difflib.get_close_matches(folder.name, beside, n=1)
-        advice = f"did you mean {folder.parent / close[0]}?" if close else TRAIN
-        raise ConfigError(f"no folder {folder} to report on: {advice}")
+        beside = neighbour(folder)
+        raise ConfigError(f"no folder {folder} to report on: {f'did you mean {beside}?' if beside else TRAIN}")
     known = list(discover(folder))
     for record in folder.rglob("run.json"):
         _require_records(RunFolder(record.parent))

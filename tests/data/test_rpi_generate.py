@@ -72,7 +72,7 @@ def test_a_broken_part_is_solved_again_and_a_made_set_is_left_alone(data, tmp_pa
     (broken.parent / ".game-0002.safetensors.99").write_bytes(b"half")  # of a process that was killed while it wrote
     other.generate(workers=1, progress=True)
     assert contents(other.folder) == contents(data.folder)
-    assert re.fullmatch(r"game 3 of 3 solved, \d+ s\n", capfd.readouterr().err)
+    assert re.fullmatch(r"solving games, 1 to do\ngame 3 of 3 solved, \d+ s\n", capfd.readouterr().err)
     assert not list(broken.parent.glob(".*"))
     before = {path: path.stat().st_mtime_ns for path in other.folder.iterdir()}
     other.generate(workers=1, progress=False)

@@ -33,6 +33,7 @@ def test_a_unit_is_reported_when_its_last_task_is_done(capsys):
     for task in (("a", 1), ("b", 1), ("a", 2), ("c", 1), ("c", 2)):
         progress.advance(task)
     assert capsys.readouterr().err.splitlines() == [
+        "solving games, 3 to do",
         "game 3 of 5 solved, 20 s, about 30 s left",
         "game 4 of 5 solved, 30 s, about 20 s left",
         "game 5 of 5 solved, 50 s",

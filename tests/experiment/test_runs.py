@@ -40,6 +40,18 @@ def test_a_folder_with_a_run_on_other_data_is_named_as_such(epo: Epo, refused: C
     assert epo_lightning.load("run").configuration == epo_lightning.load("run/checkpoints/best.ckpt").configuration
 
 
+def test_a_missing_folder_is_answered_by_the_one_beside_it_with_a_similar_name(
+    tmp_path: Path, refused: Callable[..., str]
+) -> None:
+    there = tmp_path / "v_lstm_epo-s0-1a2b3c"
+    there.mkdir()
+    (tmp_path / "notes").mkdir()
+    missing = tmp_path / "v_lstm_epo-s0-9f8e7d"
+    for words in (f"evaluate run={missing}", f"evaluate runs={missing}", f"report runs={missing}"):
+        assert f"did you mean {there}?" in refused(*words.split())
+    assert "did you mean" not in refused("evaluate", f"run={tmp_path / 'zzz'}").partition("The folder")[0]
+
+
 def test_a_run_folder_holds_what_a_run_needs(epo: Epo) -> None:
     assert epo("train", ROW, *TINY, "run_dir=run", "seed=3") == 0
     run = RunFolder.open("run")

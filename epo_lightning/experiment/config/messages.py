@@ -79,7 +79,8 @@ def one_sentence(instance: Hydra, name: str, overrides: Sequence[str]) -> Iterat
                 f"{word} names an entry of a list, whose entries have numbers: set the whole list, as in "
                 "energy.own=[goal,vel]"
             ) from error
-        raise ConfigError(sentence(error)) from error
+        unnamed = "Config group override must be a string" in str(error) and _no_name(instance, overrides)
+        raise ConfigError(unnamed or sentence(error)) from error
 
 
 def refuse_merged(instance: Hydra, word: str, where: str = "") -> None:
@@ -120,6 +121,15 @@ def _other_kind(key: str, value: str) -> str:
     if value.startswith("["):
         return f"{key} is a dictionary, not the list {value}: set one of its entries by {key}.<name>=<value>"
     return f"{key} is a list, not the dictionary {value}: set it by {key}=[...]"
+
+
+def _no_name(instance: Hydra, overrides: Sequence[str]) -> str:
+    """The error message for a number or a dictionary as the option of a group; empty if no override has one."""
+    for word in overrides:
+        group, _, option = word.lstrip("+").partition("=")
+        if (options := options_of(instance, group)) and option not in options:
+            return f"{word} chooses an option that is no name: {_known(option, options)}"
+    return ""
 
 
 def _chosen(overrides: Sequence[str]) -> str:
@@ -222,6 +232,9 @@ def _unknown_key(instance: Hydra, name: str, key: str, overrides: Sequence[str])
             continue
     whole, walked = config, list[str]()
     for word in key.replace("/", ".").split("."):
+        if walked and not isinstance(config, DictConfig):
+            whole_key = ".".join(walked)
+            return f"unknown key {key!r}: {whole_key} is {config}, a value without keys: set it by {whole_key}=<value>"
         names = [str(known) for known in config] if isinstance(config, DictConfig) else []
         if not walked and word != "hydra":
             names = [known for known in names if known != "hydra"]

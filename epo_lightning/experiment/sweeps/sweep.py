@@ -113,7 +113,9 @@ class Sweep:
                 f"; `epo report {override('runs', name)}` reports on runs in a folder" if Path(name).is_dir() else ""
             )
             raise ConfigError(
-                f"no sweep {what} has begun below {home}: " + (f"known: {begun}" if begun else "none has") + of_runs
+                f"no sweep {what} has begun below {home}: "
+                + (f"known: {begun}" if begun else "none has, `epo sweep` lists those that can be begun")
+                + of_runs
             )
         return alike[0]
 
