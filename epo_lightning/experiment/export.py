@@ -6,7 +6,7 @@ import copy
 import dataclasses
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -54,7 +54,9 @@ class Program(nn.Module):
         return {name: getattr(forecast, name) for name in OUTPUTS}
 
 
-def export(settings: ExportSettings, overrides: Sequence[str] = ()) -> tuple[Path, float]:
+def export(
+    settings: ExportSettings, overrides: Sequence[str] = (), tell: Callable[[str], None] = lambda line: None
+) -> tuple[Path, float]:
     """Write a run's forecaster as a program (``torch.export``), for any number of scenes.
 
     The file also says its title, time step, and what :func:`describe` says. Other sizes are those of the example.
@@ -62,6 +64,7 @@ def export(settings: ExportSettings, overrides: Sequence[str] = ()) -> tuple[Pat
     Args:
         settings: the run, the scenes that are the example, and the file.
         overrides: the user's overrides; settings of other data that they name do not follow the run.
+        tell: called with a line of progress before the longest part.
 
     Returns:
         the file, and the largest difference between the program in it and the forecaster on the example.
@@ -82,6 +85,7 @@ def export(settings: ExportSettings, overrides: Sequence[str] = ()) -> tuple[Pat
     forecast = forecaster.predict(scenes)
     wanted = {name: getattr(forecast, name) for name in OUTPUTS}
     tensors = inputs_of(forecaster, scenes)
+    tell(f"{of_run.title}: the program is traced and compared, which can take some minutes")
     program = program_of(forecaster, tensors, scenes.dt)
     with TemporaryDirectory(dir=file.parent, prefix=".export-") as folder:
         unchecked = Path(folder) / file.name

@@ -230,7 +230,7 @@ def export_and_print(config: dict[str, Any], overrides: Sequence[str]) -> None:
     settings = check_settings("export", config)
     from epo_lightning.experiment.export import export
 
-    file, difference = export(settings, overrides)
+    file, difference = export(settings, overrides, partial(print, flush=True))
     size = file.stat().st_size / 1e6
     print(f"wrote {file} ({size:.1f} MB); its outputs differ from the forecaster's by {difference:.1g} at most")
 

@@ -74,8 +74,11 @@ def test_a_program_gives_the_forecasts_of_its_forecaster_in_another_process(
 ) -> None:
     monkeypatch.setenv("EPO_CACHE", str(tmp_path))  # no data set: the scenes that ship with the run are the example
     settings = ExportSettings(run=name, out=str(tmp_path / "it.pt2"))
-    file, difference = export(settings)
+    told: list[str] = []
+    file, difference = export(settings, tell=told.append)
     assert difference <= 1e-5
+    assert len(told) == 1
+    assert "is traced" in told[0]
     forecaster, scenes = epo_lightning.load(name), pretrained.examples(name)
     free = name == "rpi/v_lstm_sc"  # a game's program has one number of agents
     batches = [inputs_of(forecaster, scenes[slice(count)]) for count in (1, 7)]  # other batches than the example's
