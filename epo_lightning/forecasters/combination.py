@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from epo_lightning.game.energy import FEATURES, GRADIENT, RESIDUALS, STAGES
+from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError, parts
 from epo_lightning.solvers.base import PATH, SAMPLES, STATIONARY, STEPS, TABLES
 
@@ -66,7 +67,11 @@ class Combination:
         ):
             if lacking := needed - self.energy.offers:  # all of them are needed
                 energy = f"energy.name={self.names['energy']}"
-                return f"{part} needs an energy with {_and(lacking)}, which {energy} does not offer"
+                reason = f"{part} needs an energy with {_and(lacking)}, which {energy} does not offer"
+                if STAGES in lacking and isinstance(self.energy, FeatureEnergy):
+                    between = ", ".join(self.energy.between_steps)
+                    reason += f": {between} may depend on several steps, or on a state and a control together"
+                return reason
         for part, needed in (
             (backward, self.backward.needs_from_solver),
             (objective, self.objective.needs_from_solver),

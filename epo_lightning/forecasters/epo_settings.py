@@ -111,7 +111,8 @@ def check_calibration(
 
     Raises:
         ConfigError: an unknown key; a solver that does not lead to a minimum, or takes fixed steps, which need not; a game
-            with decoded reference controls; or as :class:`~epo_lightning.forecasters.calibration.Calibration`.
+            with decoded reference controls, or with reference lines; or as
+            :class:`~epo_lightning.forecasters.calibration.Calibration`.
     """
     if calibration is None:
         return None
@@ -119,6 +120,11 @@ def check_calibration(
         raise ConfigError(
             "forecaster.calibration poses the game at the first observed state, for which no reference controls are "
             "decoded: leave accref and turnrref out of energy.own, or set calibration to null"
+        )
+    if "reference" in energy.needs:
+        raise ConfigError(
+            "forecaster.calibration poses the game at the first observed state, and reference lines begin near t0, so that "
+            "the feature lane would pull agents forwards: leave it out of energy.own, or set calibration to null"
         )
     fixed = isinstance(solver, LevenbergMarquardt) and not solver.adaptive
     if STATIONARY not in solver.provides or fixed:

@@ -289,7 +289,7 @@ class FeatureEnergy(FeatureInputs):
         check_inputs(self, scene, parameters, controls)
 
     def finite_inputs(self, scene: Scene, parameters: GameParameters) -> Bool[Tensor, "B M"]:
-        """Mask of the games whose inputs are finite.
+        """Mask of the games whose inputs are finite, and whose sizes are not negative.
 
         A NaN of most inputs reaches the controls and is found there. This mask checks the others, whose NaN or infinity may
         have no effect on the solution: weights of pairs that never touch, positions of agents that no feature uses, and
@@ -297,10 +297,9 @@ class FeatureEnergy(FeatureInputs):
         """
         present = scene.agent_mask
         finite = scene.current_or_zero.isfinite().flatten(1).all(1)
-        if self.needs_shape:
-            finite = finite & self.size(scene).isfinite().flatten(1).all(1)
-        elif self.needs_reach or "size" in self.needs:
-            finite = finite & self.size(scene)[..., 0].isfinite().all(1)
+        if self.needs_shape or self.needs_reach or "size" in self.needs:
+            size = self.size(scene) if self.needs_shape else self.size(scene)[..., :1]
+            finite = finite & ((size >= 0) & (size < torch.inf)).flatten(1).all(1)
         of_modes = finite[:, None].expand(-1, parameters.initial_controls.shape[1])
         for name in self.pair:
             of_modes = of_modes & self.pair_weight(scene, parameters, name).isfinite().all(-1)

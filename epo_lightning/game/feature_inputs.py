@@ -45,10 +45,11 @@ class FeatureInputs(Energy):
         check_features(self.own, self.pair)
         if not self.own and not self.pair:
             raise ConfigError("an energy needs at least one feature")
-        if not isinstance(self.dynamics, Unicycle):
+        if type(self.dynamics) is not Unicycle:  # the kernels do not call the methods of a subclass
             raise ConfigError(
                 "named features are defined for dynamics=unicycle, not for "
-                f"{type(self.dynamics).__name__}; energy=convex works with dynamics=double_integrator"
+                f"{type(self.dynamics).__name__}; energy=convex works with dynamics=double_integrator, and other dynamics "
+                "need an energy of their own (docs/extend.md)"
             )
         check_whole("energy.pair_stride", self.pair_stride)
         for name, own in self.own_features.items():

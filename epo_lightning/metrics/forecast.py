@@ -12,6 +12,7 @@ from torchmetrics import Metric
 
 from epo_lightning.checks import check_choice
 from epo_lightning.forecast import JointForecast, Status
+from epo_lightning.host import readable
 from epo_lightning.metrics.functional import expected_calibration_error, reliability
 from epo_lightning.metrics.functional.calibration import BINS
 from epo_lightning.metrics.functional.displacement import Errors
@@ -55,6 +56,8 @@ COLUMNS = (
     *CONSTRAINT_METRICS,
 )
 """Scores that are means over scenes."""
+LARGEST_EXCESS = 1e-2
+"""Largest difference from one of the sum of probabilities, which half precision rounds."""
 OWN = "own/"
 """Beginning of the names of registered metrics (:func:`own_values`)."""
 
@@ -139,8 +142,18 @@ class ForecastMetrics(Metric):
         """Count a batch of scenes.
 
         Raises:
-            ValueError: the scene has no future or no sizes, or another number of agents or steps than the forecast.
+            ValueError: the scene has no future or no sizes, or another number of agents or steps than the forecast; states
+                without headings; or probabilities that do not sum to one (not checked on a GPU, which would have to wait).
         """
+        if forecast.states.shape[-1] != 4:
+            raise ValueError(
+                f"forecast.states has shape {list(forecast.states.shape)}; it takes [B, M, N, K, 4]: x, y, heading, speed"
+            )
+        total = forecast.probabilities.sum(1)
+        if readable(total) and ((total - 1).abs() > LARGEST_EXCESS).any():
+            raise ValueError(
+                f"forecast.probabilities [B, M] must sum to one for every scene, not to {total.tolist()[:4]}"
+            )
         average = Errors.average(forecast.states, *observed_future(scene, "displacements need"))
         found = {**forecast_values(forecast, scene, average, self.shape), **own_values(forecast, scene)}
         none = torch.full_like(found["minADE"], torch.nan)

@@ -15,6 +15,7 @@ from epo_lightning.drive.rpi import ENERGY as RPI
 from epo_lightning.drive.rpi import RPIWorld
 from epo_lightning.forecast import GameParameters
 from epo_lightning.forecasters.calibration import Calibration, _cost
+from epo_lightning.forecasters.epo_settings import check_calibration
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import HEADING, Scene, wrapped
@@ -204,6 +205,8 @@ def test_no_steps_change_nothing_and_invalid_settings_are_refused() -> None:
     for settings in ({"steps": -1}, {"noise": 0.0}, {"spread": -1.0}, {"starts": []}, {"starts": [math.inf]}):
         with pytest.raises(ConfigError, match=f"calibration.{next(iter(settings))}"):
             Calibration(**settings)
+    with pytest.raises(ConfigError, match="the feature lane would pull agents forwards"):
+        check_calibration({"steps": 3}, FeatureEnergy(["goal", "lane"], pair=["proximity"]), SOLVER)
 
 
 def test_a_scene_is_calibrated_as_if_it_were_alone() -> None:

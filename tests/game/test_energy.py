@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 import epo_lightning
 from epo_lightning.game.circles import overlap, separation
 from epo_lightning.game.dynamics import Unicycle
+from epo_lightning.game.energy import Energy
 from epo_lightning.game.feature_derivatives import nearest_point, pair_derivatives
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.game.features import (
@@ -28,6 +29,24 @@ from epo_lightning.game.features import (
     pair_feature,
 )
 from epo_lightning.registry import ConfigError, build
+from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
+
+
+class HalfSpeed(Unicycle):
+    """Dynamics of the user, derived from those of the features, whose methods the kernels do not call."""
+
+
+class Unnamed(Energy):
+    """An energy of the user that returns a term which it does not name."""
+
+    own, pair, dynamics = ("goal",), (), Unicycle()
+
+    def own_terms(self, scene, parameters, states, controls):
+        away = states[..., -1, :2] - parameters.goals
+        return {"goal": away.square().sum(-1), "acc": controls[..., 0].square().sum(-1)}
+
+    def pair_terms(self, scene, parameters, first, second):
+        return {}
 
 
 def dense_jacobian(energy, scene, parameters, controls):
@@ -240,6 +259,7 @@ def test_the_energy_is_an_exact_potential_of_the_agents_costs():
         ({"own": ["velb"], "bounds": {"vel": 2.0}}, r"energy.bounds.vel must be \[lowest, highest\], .*, not 2.0"),
         ({"own": ["velb"], "bounds": {"vel": (0.0, 1.0, 2.0)}}, r"energy.bounds.vel must be \[lowest, highest\]"),
         ({"own": ["velb"], "bounds": [0.0, 1.0]}, "energy.bounds must map signals"),
+        ({"own": ["goal"], "dynamics": HalfSpeed()}, "are defined for dynamics=unicycle, not for HalfSpeed"),
     ],
 )
 def test_bad_energies_are_refused(arguments, message, monkeypatch):
@@ -248,6 +268,28 @@ def test_bad_energies_are_refused(arguments, message, monkeypatch):
         FeatureEnergy(**arguments)
     with pytest.raises(ConfigError, match=message):
         build("energy", {"name": "features", **arguments})
+
+
+def test_tensors_on_another_device_than_the_controls_are_named():
+    """The device ``meta`` stands for a GPU: kernels would read an address of the other device's memory."""
+    scene = random_scene(1, 2)
+    parameters, energy = random_game(scene, own=("goal",)), FeatureEnergy(["goal"])
+    weights = {"goal": parameters.own_weights["goal"].to("meta")}
+    for moved, game, named in (
+        (scene.to("meta"), parameters, r"scene\.history is on the device meta, and the controls are on cpu"),
+        (scene, replaced(parameters, goals=parameters.goals.to("meta")), r"parameters\.goals is on the device meta"),
+        (scene, replaced(parameters, own_weights=weights), r"parameters\.own_weights\['goal'\] is on the device meta"),
+    ):
+        with pytest.raises(ValueError, match=named):
+            LevenbergMarquardt()(energy, moved, game)
+
+
+def test_terms_that_an_energy_does_not_name_are_refused():
+    """They would be minimised, and be no part of any agent's objective."""
+    scene = random_scene(1, 2)
+    parameters = random_game(scene, own=("goal", "acc"))
+    with pytest.raises(ValueError, match=r"Unnamed\.own_terms returns \['acc', 'goal'\], and own names \['goal'\]"):
+        Unnamed().objectives(scene, parameters, parameters.initial_controls)
 
 
 def test_a_stride_beyond_the_horizon_is_refused():

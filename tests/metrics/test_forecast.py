@@ -6,6 +6,7 @@ import dataclasses
 import math
 from pathlib import Path
 
+import jaxtyping
 import pytest
 import torch
 import torch.distributed
@@ -180,6 +181,18 @@ def test_missing_parts_are_named() -> None:
         ForecastMetrics().update(case.forecast(), Scene(history, 0.1, future=case.future))
     with pytest.raises(ConfigError, match="did you mean 'disc'"):
         ForecastMetrics(shape="discs")
+
+
+def test_positions_without_headings_and_probabilities_of_another_sum_are_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # the tests' own checks would come first
+    case = make_case(0)
+    forecast, metrics = case.forecast(), ForecastMetrics(shape="box")
+    with pytest.raises(ValueError, match=r"forecast\.states has shape \[.*, 2\]; it takes \[B, M, N, K, 4\]"):
+        metrics.update(dataclasses.replace(forecast, states=forecast.states[..., :2]), case.scene())
+    with pytest.raises(ValueError, match=r"forecast\.probabilities .* must sum to one for every scene, not to \["):
+        metrics.update(dataclasses.replace(forecast, probabilities=2 * case.probabilities), case.scene())
 
 
 def test_long_float32_sums_keep_their_digits() -> None:

@@ -277,7 +277,6 @@ class _Rounds:
         """The state after the Gauss-Newton steps of the first round; ``initial`` is E [B, M] at the start."""
         multipliers = {name: torch.zeros_like(value) for name, value in game.excess(controls).items()}
         penalty, finite = torch.full_like(initial, solver.penalty), initial.isfinite()
-        slope = dense.gradient(game.objective, game.scene, game.parameters, controls)[1].flatten(2).norm(dim=-1)
         found, damping = solver.inner().run(*game.augmented(multipliers, penalty, controls), solver.steps)
         return cls(
             solver,
@@ -287,7 +286,7 @@ class _Rounds:
             multipliers,
             penalty,
             torch.full_like(initial, torch.inf),
-            1.0 + slope,
+            1.0 + _slope(game, controls),
             found.gradient_norm,
             finite,
             torch.zeros_like(finite),
@@ -309,8 +308,10 @@ class _Rounds:
         # Above a multiplier's slack, h counts; far below, the multiplier itself does, which the update removes.
         missing = _largest({name: h.maximum(-multipliers[name] / mu) for name, h in excess.items()})
         met, flat = missing <= solver.tolerance, math.sqrt(torch.finfo(norm.dtype).eps)
-        # The update is that of a minimum: far from one, more steps are taken first.
-        near = torch.where(met, flat, max(flat, NEAR)) * self.steepest[rows]
+        # The update is that of a minimum: far from one, more steps are taken first. At a solution the constraints balance
+        # the gradient of E, which may be steeper there than at the start, and whose rounding then decides what is flat.
+        steepest = self.steepest[rows]
+        near = torch.where(met, flat * steepest.maximum(1.0 + _slope(game, controls)), max(flat, NEAR) * steepest)
         settled = was_open & (norm <= near)
         for name, multiplier in multipliers.items():
             updated = (multiplier + mu * excess[name]).clamp_min(0.0)
@@ -323,6 +324,11 @@ class _Rounds:
         self.count[rows] += was_open.long()
         self.solved[rows] |= settled & met
         self.open[rows] = was_open & ~(settled & met) & ~hopeless
+
+
+def _slope(game: ConstrainedGame, controls: Tensor) -> Float[Tensor, "B M"]:
+    """Norm of the gradient of E, without the constraints."""
+    return dense.gradient(game.objective, game.scene, game.parameters, controls)[1].flatten(2).norm(dim=-1)
 
 
 def _largest(values: Mapping[str, Tensor]) -> Float[Tensor, "B M"]:

@@ -53,6 +53,33 @@ def least_distance(states: torch.Tensor) -> float:
     return float(apart[:, :, *torch.triu_indices(states.shape[2], states.shape[2], 1)].min())
 
 
+def test_a_start_with_a_small_gradient_does_not_ask_for_more_than_double_precision_gives():
+    """Three cars that drive straight on at first: at the solution, the constraints balance a gradient of E 19 times as steep
+    as at the start, whose rounding is above a bound relative to the start alone."""
+    current = torch.tensor([[-10.0, 0.0, 0.0, 5.0], [10.0, 0.4, math.pi, 5.0], [0.3, -12.0, math.pi / 2, 5.0]])
+    size = torch.tensor([4.5, 1.9], dtype=torch.double).expand(1, 3, 2)
+    scene = Scene(current.double()[None, :, None], dt=0.2, size=size)
+    turning = torch.tensor([0.0, 0.001], dtype=torch.double)
+    parameters = GameParameters(
+        own_weights={
+            name: torch.full((1, 1, 3), weight).double() for name, weight in (("goal", 1), ("acc", 1), ("turnr", 5))
+        },
+        pair_weights={"proximity": torch.ones(1, 1, 3, dtype=torch.double)},
+        goals=torch.tensor([[[[10.0, 0.0], [-10.0, 0.4], [0.3, 10.0]]]], dtype=torch.double),
+        initial_controls=turning.expand(1, 1, 3, 20, 2).clone(),
+    )
+    energy = FeatureEnergy(["goal", "acc", "turnr"])
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # rounding, and with it the number of rounds, depends on the number of threads
+    try:
+        solution = AugmentedLagrangian()(energy, scene, parameters)
+    finally:
+        torch.set_num_threads(threads)
+    assert solution.constraints is not None
+    assert solution.status.item() == Status.COMPLETED
+    assert solution.constraints.rounds.item() < 60
+
+
 def test_a_bound_has_the_multiplier_of_the_closed_form():
     """min 1/2 w^2 (a - 2)^2 with a <= 0.5: a = 0.5 and lambda = w^2 (2 - 0.5)."""
     energy = FeatureEnergy(own=["accref", "turnrref", "accb"], pair=[], bounds={"acc": (-1.0, 0.5)})

@@ -253,7 +253,7 @@ def make(
 
     @func
     def valid(g: Game, game: int, n: int, agents: Numbers):
-        """Whether inputs are finite whose NaN may not show in the result, and whether the lines exist."""
+        """Whether inputs are finite whose NaN may not show in the result, no size is negative, and the lines exist."""
         b = game // g.M
         flag = 2 * g.N
         if lane() == 0:
@@ -266,11 +266,11 @@ def make(
                 if not wp.isfinite(g.initial[4 * row + e]):
                     sound = 0
             if pair_count(g) > 0 or own_slot(g, STEER) >= 0:
-                if not wp.isfinite(g.size[2 * row]):
+                if g.size[2 * row] < T(0.0) or not wp.isfinite(g.size[2 * row]):
                     sound = 0
             for slot in range(pair_count(g)):
                 if pair_feature(g, slot) >= 2:  # all but those of discs read the width
-                    if not wp.isfinite(g.size[2 * row + 1]):
+                    if g.size[2 * row + 1] < T(0.0) or not wp.isfinite(g.size[2 * row + 1]):
                         sound = 0
             if own_slot(g, LANE) >= 0:
                 chosen = int(g.reference[game * g.N + agents[i]])

@@ -12,6 +12,12 @@ INLINE bool finite(T value) {
     return value - value == 0;
 }
 
+/// Whether a length or width is finite and not negative.
+template <class T>
+INLINE bool sound(T size) {
+    return size >= 0 && finite(size);
+}
+
 /// Whether the reference lines of a problem exist and its inputs are finite. It checks the inputs whose NaN may not show in the
 /// result, such as the weight of a pair that never touches, or points of a line that are never the nearest.
 template <class T>
@@ -26,8 +32,8 @@ bool valid(const EpoGame& game, int64_t problem) {
             const T* start = static_cast<const T*>(game.initial) + b * game.initial_b + i * game.initial_n;
             for (int e = 0; e < 4; ++e)
                 if (!finite(start[e])) return false;
-            if ((coupled || game.own[STEER]) && !finite(static_cast<const T*>(game.size)[2 * row])) return false;
-            if (has_state_pairs(game) && !finite(static_cast<const T*>(game.size)[2 * row + 1])) return false;
+            if ((coupled || game.own[STEER]) && !sound(static_cast<const T*>(game.size)[2 * row])) return false;
+            if (has_state_pairs(game) && !sound(static_cast<const T*>(game.size)[2 * row + 1])) return false;
             if (game.reference) {
                 const int64_t line = game.reference[problem * game.N + i];
                 if (line < 0 || line >= game.lines) return false;
