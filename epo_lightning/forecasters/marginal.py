@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from torch.nn import functional as F
+
 from epo_lightning import losses
 from epo_lightning.backbones.base import Backbone
 from epo_lightning.decoders.trajectories import Trajectories
@@ -23,7 +25,8 @@ class Marginal(Forecaster):
     """Forecaster of trajectories per agent, trained by minADE and a classification loss (Section 5, "Baselines").
 
     Joint futures are combined afterwards: each agent's modes are ordered by probability, and joint mode m consists of the
-    m-th most likely mode of every agent.
+    m-th most likely mode of every agent. The network predicts positions; headings and speeds are those of the motion
+    (:func:`~epo_lightning.game.tracking.with_motion`), and zero in training.
 
     Args:
         backbone: the observation encoder.
@@ -59,7 +62,10 @@ class Marginal(Forecaster):
     def forward(self, scene: Scene) -> JointForecast:
         current = scene.current_or_zero
         positions, probabilities, logits = self.decoder(self.backbone(scene), current[..., :2])
-        states = with_motion(positions, current[:, None].expand(*positions.shape[:3], 4), scene.dt)
+        if self.training:  # no loss reads headings and speeds
+            states = F.pad(positions, (0, 2))
+        else:
+            states = with_motion(positions, current[:, None].expand(*positions.shape[:3], 4), scene.dt)
         states, probabilities, logits = marginal_to_joint(states, probabilities, logits)
         # The product of probabilities, as a sum of logarithms: for many agents the product would underflow in float32.
         of_agents = log_probabilities(probabilities, logits, 1)

@@ -64,24 +64,31 @@ def observed_controls(
     return controls, error
 
 
+TRAVELLED = 0.5
+"""Distance [m] after which the direction of a motion counts as the agent's heading."""
+
+
 def with_motion(
     positions: Float[Tensor, "*batch K 2"], current: Float[Tensor, "*batch 4"], dt: float
 ) -> Float[Tensor, "*batch K 4"]:
-    """States from positions, with heading and speed of the motion between steps.
+    """States from positions, with heading and speed of the motion.
 
-    A standing agent keeps the heading of its last motion, which is that of ``current`` before the first one.
+    A speed is that of the motion between two steps. A heading is the direction of the motion from the place of the heading
+    before, once it is ``TRAVELLED`` long: forecast positions are not smooth, and those of a standing agent have directions
+    that mean nothing. Before, the agent keeps the heading of ``current``.
     """
-    before = torch.cat((current[..., None, :2], positions[..., :-1, :]), -2)
-    travelled = (positions - before).detach()
-    length = travelled.norm(dim=-1)
-    headings = torch.cat((current[..., None, HEADING], torch.atan2(travelled[..., 1], travelled[..., 0])), -1)
-    steps, reach = length.shape[-1], 1
-    moved = torch.where(length > 1e-6, torch.arange(1, steps + 1, device=length.device), 0)
-    while reach < steps:  # the last step with a motion, among twice as many steps each time; ONNX has no cummax
-        moved = torch.cat((moved[..., :reach], torch.maximum(moved[..., reach:], moved[..., :-reach])), -1)
-        reach *= 2
-    heading = headings.gather(-1, moved)
-    return torch.cat((positions, heading[..., None], length[..., None] / dt), -1)
+    place, heading = current[..., :2], current[..., HEADING]
+    headings = []
+    with torch.no_grad():
+        for position in positions.unbind(-2):
+            east, north = (position - place).unbind(-1)
+            moved = east.square() + north.square() >= TRAVELLED**2
+            heading = torch.where(moved, torch.atan2(north, east), heading)
+            place = torch.where(moved[..., None], position, place)
+            headings.append(heading)
+        before = torch.cat((current[..., None, :2], positions[..., :-1, :]), -2)
+        speed = (positions - before).norm(dim=-1) / dt
+    return torch.cat((positions, torch.stack(headings, -1)[..., None], speed[..., None]), -1)
 
 
 def demonstrated(scene: Scene) -> Bool[Tensor, "B N K"]:

@@ -15,6 +15,7 @@ from torch.testing import assert_close
 from epo_lightning.game.double_integrator import DoubleIntegrator
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.game.tracking import demonstrated, observed_controls, with_motion
+from epo_lightning.metrics.functional import overlapping_pairs
 from epo_lightning.scene import HEADING, Scene
 
 EULER = Unicycle()
@@ -101,23 +102,43 @@ def test_heading_and_speed_of_a_motion_have_no_gradient():
 
 @given(
     st.lists(
-        st.lists(st.sampled_from([(0, 0), (0, 1), (1, 0), (-2, 1)]), min_size=9, max_size=9), min_size=1, max_size=3
+        st.lists(st.sampled_from([(0, 0), (0, 1), (1, 0), (-2, 1), (0.1, 0.3), (-0.3, 0.1)]), min_size=9, max_size=9),
+        min_size=1,
+        max_size=3,
     )
 )
-def test_a_standing_agent_keeps_the_heading_of_its_last_motion(motions: list[list[tuple[int, int]]]):
-    """A slow version goes from step to step."""
+def test_a_heading_is_the_direction_of_the_last_half_metre(motions: list[list[tuple[float, float]]]):
+    """A slow version goes from step to step; an agent that stands, or moves less, keeps its heading."""
     current = torch.tensor([[1.0, 2.0, 0.7, 3.0]] * len(motions), dtype=torch.float64)
     positions = current[:, None, :2] + torch.tensor(motions, dtype=torch.float64).cumsum(1)
     expected = []
     for steps in motions:
-        heading = 0.7
+        heading, east, north = 0.7, 0.0, 0.0  # the way since the place at which the heading changed
         expected.append([])
         for x, y in steps:
-            heading = math.atan2(y, x) if (x, y) != (0, 0) else heading
+            east, north = east + x, north + y
+            if math.hypot(east, north) >= 0.5:
+                heading, east, north = math.atan2(north, east), 0.0, 0.0
             expected[-1].append([heading, math.hypot(x, y) / 0.5])
     states = with_motion(positions, current, 0.5)
     assert torch.equal(states[..., :2], positions)
     assert_close(states[..., 2:], torch.tensor(expected, dtype=torch.float64))
+
+
+def test_cars_that_stand_side_by_side_do_not_overlap_when_their_forecasts_jitter():
+    """By directions of single steps, 5 cm of noise would turn each of them by any angle, and nearly all scenes overlap."""
+    generator = torch.Generator().manual_seed(0)
+    current = torch.zeros(50, 1, 2, 4, dtype=torch.float64)
+    current[..., 1, 1] = 3.5
+    noise = 0.05 * torch.randn(50, 1, 2, 20, 2, dtype=torch.float64, generator=generator)
+    states = with_motion(current[..., None, :2] + noise, current, 0.2)
+    size = torch.tensor([4.5, 1.8], dtype=torch.float64).expand(50, 2, 2)
+    here = torch.ones(50, 2, dtype=torch.bool)
+    assert not overlapping_pairs(states[:, 0], size, here, "box").any()
+    turned = states.clone()
+    before = torch.cat((current[..., None, :2], states[..., :-1, :2]), -2)
+    turned[..., 2] = torch.atan2(*(states[..., :2] - before).flip(-1).unbind(-1))
+    assert overlapping_pairs(turned[:, 0], size, here, "box").all()
 
 
 def test_noise_does_not_become_wild_controls():
