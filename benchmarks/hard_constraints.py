@@ -89,9 +89,7 @@ def report(scene: Scene) -> None:
     kept = (hard.status != Status.STOPPED).all(1)
     print(f"{total} scenes, {total - apart} of which start too close, {apart - int(kept.sum())} without a solution")
     if not kept.any():
-        raise SystemExit(
-            "benchmarks.hard_constraints: there is no scene whose constraints can be met; choose other data"
-        )
+        raise SystemExit(NOTHING)
     scene, hard = scene[kept], hard[kept]
     assert hard.constraints is not None
     rounds = hard.constraints.rounds.double()

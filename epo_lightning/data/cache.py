@@ -195,8 +195,8 @@ def write(
                 "report": report,
             }
             for name, text in (texts or {}).items():
-                (work / name).write_text(text)
-            (work / MANIFEST).write_text(json.dumps(manifest, indent=2, sort_keys=True) + "\n")
+                (work / name).write_text(text, encoding="utf-8")
+            (work / MANIFEST).write_text(json.dumps(manifest, indent=2, sort_keys=True) + "\n", encoding="utf-8")
             work.replace(folder)
         finally:
             shutil.rmtree(work, ignore_errors=True)
@@ -235,7 +235,7 @@ def manifest(folder: Path, command: str = "", config: Mapping[str, Any] | None =
         raise CacheError(f"no {folder.name.rpartition('-')[0]} data at {folder}{hint}")
     path = folder / MANIFEST
     try:
-        content = json.loads(path.read_text())
+        content = json.loads(path.read_text(encoding="utf-8"))
         found, name = content["format"], content["hash"]
         content["files"], content["config"]
     except FileNotFoundError:
@@ -358,7 +358,7 @@ def _is_checked(path: Path, sha256: str) -> bool:
     if path.stat().st_size < LARGE:
         return False
     try:
-        return bool(json.loads(_checks(path).read_text()).get(path.name) == _state(path, sha256))
+        return bool(json.loads(_checks(path).read_text(encoding="utf-8")).get(path.name) == _state(path, sha256))
     except (OSError, ValueError, AttributeError):
         return False
 
@@ -366,7 +366,7 @@ def _is_checked(path: Path, sha256: str) -> bool:
 def _remember(path: Path, sha256: str) -> None:
     """Remember that a large file was checked."""
     try:
-        known = json.loads(_checks(path).read_text())
+        known = json.loads(_checks(path).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         known = {}
     with suppress(OSError):  # a cache may be read-only once its data sets are made

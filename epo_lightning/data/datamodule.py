@@ -265,7 +265,8 @@ class SceneDataModule(LightningDataModule):
         sampler = BatchSampler(data, self.batch_size, shuffle, self.order_seed)
         if not len(sampler):
             raise ConfigError(
-                f"batch_size is {self.batch_size}, but the split {split!r} has only {len(data)} samples: not one full batch"
+                f"data.batch_size is {self.batch_size}, but the split {split!r} has only {len(data)} samples: not one full "
+                "batch"
             )
         return DataLoader(data, sampler=sampler, batch_size=None, num_workers=0)  # type: ignore[arg-type]
 

@@ -104,10 +104,10 @@ def constant(speed: Float[Tensor, " B"], acceleration: float, steps: int, dt: fl
 
 
 def _stop(scene: Scene, plan: Plan) -> tuple[Tensor, Tensor]:
-    """A plan that brakes until the agent stands, with all agents drawn where they are."""
-    steps = plan.controls.shape[1]
+    """A plan that brakes until the agent stands, with the agents of the plan drawn where they are."""
+    agents, steps = plan.states.shape[1:3]
     braking = constant(scene.current[:, EGO, SPEED], -BRAKING, steps, scene.dt)
-    return braking, scene.current[:, :, None].expand(-1, -1, steps, -1)
+    return braking, scene.current[:, :agents, None].expand(-1, -1, steps, -1)
 
 
 class Planner(Protocol):

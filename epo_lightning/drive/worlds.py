@@ -57,7 +57,8 @@ def _of_roads(data: Mapping[str, Any]) -> str | None:
     for name in ("dt", "history", "horizon", "agents", "lanes", "lines"):
         if getattr(own, name) != getattr(paper, name):
             return f"{wanted}, with data.windows.{name}={getattr(paper, name)}, not {getattr(own, name)}"
-    return None if data["frame"] == "aligned" else f"{wanted}, with data.frame=aligned, not {data['frame']}"
+    frame = data.get("frame", "aligned")
+    return None if frame == "aligned" else f"{wanted}, with data.frame=aligned, not {frame}"
 
 
 def _sumo(episodes: int, seed: int, kind: str) -> World:

@@ -66,7 +66,7 @@ def drive(settings: DriveSettings, tell: Callable[[str], None]) -> list[Path]:
     kinds = where.kinds if settings.others is None else tuple(settings.others)
     where.check_kinds(settings.world, kinds)
     planners: dict[str, Make] = {}
-    for name, make in _planners(settings, where):
+    for name, make in _planners(settings, where, tell):
         if name in planners:
             raise ConfigError(f"two planners are called {name!r}: name each way and baseline once, and rename runs")
         planners[name] = make
@@ -185,7 +185,7 @@ def _digests(settings: DriveSettings) -> dict[str, str]:
     return {path: file_digest(RunFolder.open(path).checkpoint(settings.checkpoint))[:16] for path in paths}
 
 
-def _planners(settings: DriveSettings, where: Place) -> Iterator[tuple[str, Make]]:
+def _planners(settings: DriveSettings, where: Place, tell: Callable[[str], None]) -> Iterator[tuple[str, Make]]:
     """Planners by name, made for a world."""
     paths = settings.run if settings.ways else []
     runs = [RunFolder.open(path) for path in paths]
@@ -202,7 +202,7 @@ def _planners(settings: DriveSettings, where: Place) -> Iterator[tuple[str, Make
                 make = _of_run(forecaster, way, settings.mode == "nearest")
             except ConfigError as error:  # a forecaster without a game has no warm start and no pair terms
                 lacking.append(f"{path}, {way}: {error}")
-                print(f"left out: {lacking[-1]}", flush=True)
+                tell(f"left out: {lacking[-1]}")
                 continue
             yield WAYS[way].format(title), make
     if len(lacking) == len(paths) * len(settings.ways) and not baselines:

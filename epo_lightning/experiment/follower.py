@@ -53,8 +53,9 @@ def follow(place: Place, run: RunFolder | None = None) -> None:
     seed_everything(settings.seed, workers=True, verbose=False)
     data, model = assembly.build(settings)
     watchers = callbacks.run_callbacks(settings.callbacks, run, settings.title)
-    # Callbacks that decide when to stop or have a state in the checkpoint. Only the leader writes files and prints.
-    deciding = [w for w in watchers if isinstance(w, Checkpoint | EarlyStopping | callbacks.RandomStates)]
+    # Those that decide when to stop, move the loop, or have a state in the checkpoint. Only the leader writes and prints.
+    kinds = Checkpoint | EarlyStopping | callbacks.NextEpoch | callbacks.RandomStates
+    deciding = [watcher for watcher in watchers if isinstance(watcher, kinds)]
     trainer = assembly.build_trainer(
         settings.trainer, run, deciding, devices=settings.trainer.devices, strategy=DDP(place, store)
     )

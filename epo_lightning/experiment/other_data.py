@@ -188,6 +188,11 @@ def follow(
         windows["interpolate"] = True
     most = windows.get("agents", theirs["agents"])
     if theirs["least_agents"] > most:
+        if "data.windows.least_agents" in given:
+            raise ConfigError(
+                f"data.windows.least_agents={theirs['least_agents']} is above the {most} agents of the run's scenes: give "
+                f"{most} or less, or data.windows.agents as well"
+            )
         windows["least_agents"] = most
     section["windows"] = windows
     if "frame" in section and "frame" in of_run.data and "data.frame" not in given:

@@ -12,6 +12,7 @@ from epo_lightning.experiment.config.settings import ReportSettings
 from epo_lightning.experiment.sweeps.sweep import Sweep
 from epo_lightning.identity import ELSEWHERE
 from epo_lightning.registry import ConfigError
+from epo_lightning.report.labels import word
 from epo_lightning.report.paper import has_values
 from epo_lightning.report.render import code
 from epo_lightning.report.results import read_results, results_name, save_results
@@ -123,7 +124,7 @@ def of_sweep(sweep: Sweep) -> Report:
     runs = os.path.relpath(sweep.root)
     return Report(
         title=sweep.label,
-        command=f"epo report {sweep.label}" + (f" runs={runs}" if runs != "runs" else ""),
+        command=f"epo report {sweep.label}" + (f" {word('runs', runs)}" if runs != "runs" else ""),
         runs=tuple(job.run for job in jobs if job.run.path in measured),
         evaluated=tuple(evaluated),
         left_out=tuple(left_out),

@@ -21,7 +21,7 @@ SAMPLES, WARM_UP = 100, 10
 """Number of measured scenes, as in the paper; and number of forecasts before them, which are not measured (warm-up)."""
 
 
-def measure(run: RunFolder, settings: Settings) -> dict[str, Any]:
+def measure(run: RunFolder, settings: Settings, devices: int | list[int]) -> dict[str, Any]:
     """Time joint forecasts of single scenes of the test split by the best checkpoint, and write the run's ``runtime.json``.
 
     Nothing but the forecast is timed: the scene is on its device already, and no metric is computed.
@@ -29,11 +29,12 @@ def measure(run: RunFolder, settings: Settings) -> dict[str, Any]:
     Args:
         run: a finished run, trained or not.
         settings: settings of the run.
+        devices: the device to compute on, as :func:`.gpus.placed` yields it.
 
     Raises:
         ConfigError: the checkpoint or the data is missing or has changed.
     """
-    device = _device(settings.trainer.accelerator)
+    device = _device(settings.trainer.accelerator, devices)
     torch.set_num_threads(settings.trainer.threads)
     forecaster = open_checkpoint(settings, run.checkpoint("best")).to(device)
     data = open_data(run, settings)
@@ -71,8 +72,10 @@ def measure(run: RunFolder, settings: Settings) -> dict[str, Any]:
     return measured
 
 
-def _device(accelerator: str) -> torch.device:
-    return torch.device("cuda" if accelerator != "cpu" and torch.cuda.is_available() else "cpu")
+def _device(accelerator: str, devices: int | list[int]) -> torch.device:
+    if accelerator == "cpu" or not torch.cuda.is_available():
+        return torch.device("cpu")
+    return torch.device("cuda", devices[0] if isinstance(devices, list) else 0)
 
 
 def _wait(device: torch.device) -> None:

@@ -187,7 +187,7 @@ def measure(run: RunFolder, settings: Settings, which: Measured, devices: int | 
     if which == "time":
         from epo_lightning.experiment import timing
 
-        timing.measure(run, settings)
+        timing.measure(run, settings, devices)
     else:
         score(run, EvaluateSettings(run=str(run.path), split=which), settings.trainer, devices)
 

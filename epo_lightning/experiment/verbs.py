@@ -79,8 +79,7 @@ def has_vehicles(data: Any) -> bool:
     """Whether some agents of a data set of recordings are no pedestrians."""
     from epo_lightning.scene import KINDS
 
-    data.setup("fit")
-    return bool((data.dataset("train").tables["kind"] != KINDS.index("pedestrian")).any())
+    return bool((data.open("train").tables["kind"] != KINDS.index("pedestrian")).any())
 
 
 def make_data(settings: GenerateSettings, overrides: Sequence[str] = ()) -> Any:

@@ -12,6 +12,7 @@ let scene = null;       // what /scenes/<index> says
 let solution = null;    // what /solve said last
 let edit = {};          // changes of the scene's game
 let asking = false, again = false;
+let opened = 0;         // number of scenes that were asked for
 let view = null;        // [x, y, width, height] of the drawing in m
 let dragging = null;
 
@@ -52,10 +53,13 @@ async function solve() {
   if (asking) { again = true; return; }
   asking = true;
   try {
-    const began = performance.now();
-    solution = await ask("/solve", edit);
-    complain(null);
-    show();
+    const began = performance.now(), asked = edit;
+    const answer = await ask("/solve", asked);
+    if (asked === edit) {  // the answer to changes of another scene is late
+      solution = answer;
+      complain(null);
+      show();
+    }
     document.body.dataset.answers = Number(document.body.dataset.answers || 0) + 1;
     document.body.dataset.milliseconds = performance.now() - began;
   } catch (error) {
@@ -66,9 +70,13 @@ async function solve() {
 }
 
 async function open(index) {
+  const turn = ++opened;
   try {
-    scene = await ask(`/scenes/${index}`);
+    const answer = await ask(`/scenes/${index}`);
+    if (turn !== opened) return;
+    scene = answer;
   } catch (error) { complain(error); return; }
+  solution = null;
   edit = fresh(index);
   view = null;
   find("title").textContent = scene.title;

@@ -21,8 +21,6 @@ from epo_lightning.report.tables import Table, distinct
 WIDEST, COLORS = 1500, 128
 """Largest width [pixels] and palette size of pictures: a page should be small enough to mail."""
 
-SCENES, WEIGHTS = "Scenes", "Learned weights"
-
 
 @dataclass(frozen=True)
 class Content:

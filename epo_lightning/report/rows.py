@@ -14,7 +14,7 @@ from typing import Any
 
 from epo_lightning.identity import differences
 from epo_lightning.registry import ConfigError
-from epo_lightning.report.columns import GAME, is_own
+from epo_lightning.report.columns import GAME, TRUE, is_own
 from epo_lightning.report.labels import labels, value_text, varying, word
 from epo_lightning.report.paper import interacts, is_papers, paper_values
 from epo_lightning.report.runs import EvaluatedRun
@@ -266,6 +266,11 @@ def require_same(runs: Iterable[EvaluatedRun], what: str, value: Callable[[Evalu
         )
 
 
+def _may_be_missing(metric: str) -> bool:
+    """Whether a scored run may lack the metric: users' own, and comparisons of weights that are the same in all scenes."""
+    return is_own(metric) or metric.startswith(TRUE)
+
+
 def _folders_apart(groups: Sequence[Sequence[EvaluatedRun]]) -> list[str]:
     """For each group of runs the folder that holds all of them; without those that hold a run of another group as well."""
     folders = [os.path.commonpath([run.path for run in group]) for group in groups]
@@ -286,9 +291,9 @@ def _row(runs: Sequence[EvaluatedRun]) -> Row:
                 f"row {run.name!r} has seed {run.seed} twice, {twin.path} and {run.path} are the same run: "
                 "move one of them away"
             )
-        # Metrics of the game, and those of users, may be missing in some runs.
+        # Metrics of the game may be missing in some runs as well.
         for metric in sorted(
-            name for name in {*first.metrics} ^ {*run.metrics} if name not in GAME and not is_own(name)
+            name for name in {*first.metrics} ^ {*run.metrics} if name not in GAME and not _may_be_missing(name)
         ):
             one, other = (first, run) if metric in first.metrics else (run, first)
             raise ConfigError(
@@ -301,7 +306,7 @@ def _row(runs: Sequence[EvaluatedRun]) -> Row:
     paper = paper_values(*known) if in_paper else {}
     cells = {}
     for metric in dict.fromkeys(metric for run in runs for metric in run.metrics):
-        scored = [run for run in runs if metric in run.metrics] if is_own(metric) else runs
+        scored = [run for run in runs if metric in run.metrics] if _may_be_missing(metric) else runs
         values = [run.metrics.get(metric, math.nan) for run in scored]
         constant = not first.learned and len({*values}) == 1
         sampled = len(values) > 1 and all(map(math.isfinite, values)) and not constant

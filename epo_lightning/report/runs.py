@@ -299,15 +299,18 @@ def _tested_data(result: Mapping[str, Any], trained: str) -> str:
     return str(result.get("data", trained))
 
 
+def data_option(section: Mapping[str, Any]) -> str:
+    """Option ``data=`` of a data set, from the ``data`` section of a configuration; RPI's hard split is ``rpi_hard``."""
+    return str(section.get("dataset") or section["name"]) + ("_hard" if section.get("split") == "hard" else "")
+
+
 def data_name(section: Mapping[str, Any]) -> str:
     """Name of a data set in tables and captions, from the ``data`` section of a configuration.
 
-    RPI's hard split is ``rpi_hard``, and each later recipe and each kind of its players is a data set. A training on a share
-    of the games is not compared with one on all of them, and scenes drawn in the shapes of two tasks are two data sets.
+    Each later recipe of RPI and each kind of its players is a data set. A training on a share of the games is not compared
+    with one on all of them, and scenes drawn in the shapes of two tasks are two data sets.
     """
-    name = str(section.get("dataset") or section["name"])
-    if section.get("split") == "hard":
-        name = f"{name}_hard"
+    name = data_option(section)
     if (recipe := data_recipe(section)) != 1:
         name = f"{name}, recipe {recipe}"
     if (players := section.get("solver")) not in (None, "potential"):

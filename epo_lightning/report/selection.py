@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.labels import natural, value_text
 from epo_lightning.report.rows import BATCH, Row, plain_rows, require_comparable, setting
-from epo_lightning.report.runs import EvaluatedRun
+from epo_lightning.report.runs import EvaluatedRun, data_option
 
 SEARCHED = ("optimizer", "backbone", "forecaster")
 """Sections whose settings are searched for the best value, like :data:`BATCH`; others are varied for comparison."""
@@ -131,10 +131,10 @@ def _overrides(row: Row) -> tuple[str, ...]:
 def _row(run: EvaluatedRun, overrides: Iterable[str]) -> list[str]:
     """Overrides that choose the row of a run: its experiment or, without one, the parts that no other override chooses."""
     if not run.experiment:
-        parts = {"data": run.data, "backbone": run.backbone, "forecaster": run.forecaster}
+        parts = {"data": data_option(run.config["data"]), "backbone": run.backbone, "forecaster": run.forecaster}
         chosen = {override.partition("=")[0] for override in overrides}
         return [f"{group}={option}" for group, option in parts.items() if group not in chosen]
     return [
         f"experiment={run.experiment}",
-        *([f"data={run.data}"] if run.config["data"].get("split") == "hard" else []),
+        *([f"data={data_option(run.config['data'])}"] if run.config["data"].get("split") == "hard" else []),
     ]

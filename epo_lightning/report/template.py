@@ -153,7 +153,7 @@ class Results:
                     f"[{name}](tables/{name}/results.md)",
                     "; ".join(data),
                     ", ".join(commits),
-                    f"{seeds[0]} to {seeds[-1]}",
+                    " to ".join(str(seed) for seed in dict.fromkeys((seeds[0], seeds[-1]))),
                     str(len(runs)),
                     " to ".join(str(number) for number in dict.fromkeys((steps[0], steps[-1]))),
                     _settled(runs),

@@ -14,6 +14,7 @@ from epo_lightning.files import write_file
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.choices import choices_to_yaml
 from epo_lightning.report.costs import cost_sheets, timings_of
+from epo_lightning.report.labels import word
 from epo_lightning.report.latex import comparisons_to_latex, sheet_to_latex, to_latex
 from epo_lightning.report.made import Made, how_made
 from epo_lightning.report.paper import has_values
@@ -77,7 +78,7 @@ class Report:
         only_timed = runs and not any(map(scored, runs))
         return cls(
             title=Path(folder).expanduser().resolve().name,
-            command=f"epo report runs={folder}",
+            command=f"epo report {word('runs', str(folder))}",
             runs=tuple(runs),
             evaluated=() if only_timed else tuple(collect(folder)),
             left_out=tuple((str(run.path), why_left_out(run)) for run in known if run not in runs),

@@ -204,6 +204,16 @@ def test_a_step_without_a_plan_follows_the_last_one() -> None:
     torch.testing.assert_close(speed, torch.zeros_like(speed), rtol=0, atol=0.5)
 
 
+def test_a_first_step_without_a_plan_stops_among_more_agents_than_the_plan_has() -> None:
+    """In traffic, scenes have eight agents, and a forecaster plans for four of them."""
+    scene = Scene(torch.ones(2, 8, 1, 4), dt=0.2)
+    nothing = torch.full((2, 4, 5, 4), torch.nan)
+    broken = Plan(torch.full((2, 5, 2), torch.nan), nothing, torch.zeros(2, dtype=torch.bool))
+    stop = broken.or_else(None, scene)
+    torch.testing.assert_close(stop.states, torch.ones(2, 4, 5, 4))
+    assert stop.controls.isfinite().all()
+
+
 def test_shifted_strategies_are_padded_or_cut() -> None:
     controls = torch.arange(8.0).view(4, 2)
     torch.testing.assert_close(shifted(controls, 3), controls[1:])

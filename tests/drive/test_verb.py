@@ -67,6 +67,8 @@ def test_tables_and_films_are_written(epo: Callable[..., int], tmp_path: Path) -
         (["run=rpi/v_lstm_epo", "others=[]"], "nothing drives: name one of others"),
         (["run=rpi/v_lstm_sc", "ways=warm", "baselines=[]"], "no planner is left to drive (rpi/v_lstm_sc, warm: "),
         (["run=[rpi/v_lstm_epo,rpi/v_lstm_epo]"], "the run rpi/v_lstm_epo is named twice"),
+        (["run=rpi/v_lstm_epo", "ways=own,"], "cannot read the override"),
+        (["run=rpi/v_lstm_epo", "ways=owm"], "ways must be one of own, warm, alone, respond"),
         (["run=rpi/v_lstm_epo", "ways=[own,own]"], "two planners are called 'V-LSTM + EPO, relaxed'"),
         (["run=rpi/v_lstm_epo", "world=sum"], "unknown world 'sum': did you mean 'sumo'"),
         (

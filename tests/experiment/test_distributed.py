@@ -183,8 +183,11 @@ LONG = ("train", "experiment=rpi/v_lstm_sc", *QUIET, *RPI, DOUBLE, "optimizer.lr
 
 
 @pytest.mark.slow
-def test_a_run_on_one_device_continues_on_two(epo: Epo, monkeypatch: pytest.MonkeyPatch) -> None:
-    words = (*LONG, "trainer.max_epochs=4")
+@pytest.mark.parametrize("length", [("trainer.max_epochs=4",), ("trainer.max_epochs=null", "trainer.max_steps=14")])
+def test_a_run_on_one_device_continues_on_two(
+    epo: Epo, monkeypatch: pytest.MonkeyPatch, length: tuple[str, ...]
+) -> None:
+    words = (*LONG, *length)
     assert epo(*words, "run_dir=whole") == 0
 
     def stop(self: RandomStates, trainer: object, module: object) -> None:

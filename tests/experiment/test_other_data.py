@@ -22,6 +22,7 @@ from epo_lightning.experiment.assembly import build_data
 from epo_lightning.experiment.config.compose import compose
 from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.experiment.other_data import _files, follow
+from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder
 from epo_lightning.schema import read
 
@@ -197,6 +198,8 @@ def test_recordings_of_another_rate_are_read_at_the_runs(trained: Path) -> None:
     given = section["windows"]
     assert "data.windows.agents=8, unlike the run's 4" in notes
     assert (given["agents"], given["least_agents"], given["every"]) == (8, 6, 2)
+    with pytest.raises(ConfigError, match=r"least_agents=6 is above the 4 agents of the run's scenes: give 4 or less"):
+        follow(slower, settings, task, {"data.windows.least_agents"})
     assert follow({"name": "drawn"}, settings, task) == ({"name": "drawn"}, ())
 
 

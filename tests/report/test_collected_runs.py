@@ -173,6 +173,9 @@ def test_errors_of_inferred_costs_are_a_table_without_ranks(tmp_path: Path) -> N
         content = json.loads((run.path / "metrics.json").read_text())
         write_json(run.path / "metrics.json", {**content, "truth": {"pair_rank": rank, "pair_error": 1 - rank}})
     make_run(tmp_path / "sc", "SC", "scene_consistent", scores(1.0))
+    constant = make_run(tmp_path / "constant", "refined", "epo", scores(1.0), seed=1)  # all its weights are equal
+    content = json.loads((constant.path / "metrics.json").read_text())
+    write_json(constant.path / "metrics.json", {**content, "truth": {"pair_error": 0.9}})
     tables = build_tables(collect(tmp_path))
     found = next(table for table in tables if table.title == "rpi, test split: inferred against true costs")
     assert [row.name for row in found.rows] == ["refined", "solved"]

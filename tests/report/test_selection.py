@@ -53,6 +53,25 @@ def test_the_lowest_mean_over_seeds_wins(tmp_path: Path) -> None:
     assert f"| V-LSTM | {plain.words} | 0.200 ± 0.014 | 2 | 3 |" in table
 
 
+def test_the_command_names_a_data_set_as_it_is_chosen_and_not_as_tables_call_it(tmp_path: Path) -> None:
+    """Tables call it ``rpi_hard, recipe 2``, which is no option of ``data=``."""
+    for lr, value in ((0.1, 0.3), (0.01, 0.2)):
+        of_data = {"data.split": "hard", "data.recipe": 2}
+        settings = {"optimizer.lr": lr, **of_data}
+        make_run(
+            tmp_path / str(lr),
+            "V-LSTM",
+            "marginal",
+            scores(value),
+            split="val",
+            experiment="rpi/v_lstm",
+            settings=settings,
+        )
+    (found,) = best(tmp_path)
+    assert found.row.runs[0].data == "rpi_hard, recipe 2"
+    assert found.words == "experiment=rpi/v_lstm data=rpi_hard optimizer.lr=0.01"
+
+
 def test_the_test_split_never_chooses(tmp_path: Path) -> None:
     search(tmp_path, {(0.001, 64): [0.1], (0.0005, 64): [0.2]}, split="test")
     with pytest.raises(ConfigError, match=r"no run was scored on the validation split.*split=val"):

@@ -166,7 +166,6 @@ def _raw(recording: Recording) -> dict[str, np.ndarray]:
         "position": np.ascontiguousarray(tracks.position, dtype=float),
         "speed": np.ascontiguousarray(tracks.speed, dtype=float),
         "ids": tracks.ids.astype(np.int64),
-        "size": np.ascontiguousarray(tracks.size, dtype=float),
     }
 
 

@@ -163,7 +163,7 @@ def fingerprints(files: Sequence[Path], root: Path) -> dict[Path, list[Any]]:
     memo = root / f".fingerprints-{hashlib.sha256(min(paths).encode()).hexdigest()[:12]}.json"
     known: dict[str, list[int]] = {}
     with contextlib.suppress(OSError, ValueError, TypeError):
-        known = dict(json.loads(memo.read_text()))
+        known = dict(json.loads(memo.read_text(encoding="utf-8")))
 
     def entry(file: Path, path: str) -> list[int]:
         """Size, time of change [ns] and checksum of a file."""

@@ -169,7 +169,7 @@ def per_recording(folder: Path) -> list[str]:
     file = folder / FILE
     if not file.is_file():
         return []
-    with file.open(newline="") as text:
+    with file.open(newline="", encoding="utf-8") as text:
         rows = list(csv.DictReader(text))
     shown = [
         {

@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 AGENTS = 2
-ROBOT, PEDESTRIAN = range(AGENTS)
 DISC_RADIUS = 0.25
 """Radius of an agent's body [m] (App. "Energy Features")."""
 DISC_DIAMETER = 2 * DISC_RADIUS

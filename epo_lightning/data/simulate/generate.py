@@ -138,7 +138,7 @@ def _write_json(path: Path, content: Mapping[str, Any]) -> None:
 def _finished(work: Path, number: int, name: str) -> dict[str, Any] | None:
     """The record of a finished recording; None if it is not finished, damaged or of another configuration."""
     try:
-        done = json.loads(_done_path(work, number).read_text())
+        done = json.loads(_done_path(work, number).read_text(encoding="utf-8"))
         if done["config"] != name:
             return None
         for file, expected in done["files"].items():
@@ -157,7 +157,7 @@ def verify(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
     """
     remedy = f"delete the folder {folder} and make it again"
     try:
-        manifest = json.loads((folder / cache.MANIFEST).read_text())
+        manifest = json.loads((folder / cache.MANIFEST).read_text(encoding="utf-8"))
         found, files = manifest["hash"], manifest["files"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise cache.CacheError(

@@ -352,6 +352,10 @@ class ExportSettings(ForecastSettings):
     scenes: int | None = 4
 
 
+Way = Literal["own", "warm", "alone", "respond"]
+"""How a run plans (``drive/planners.py``)."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class DriveSettings:
     """Configuration of ``epo drive``."""
@@ -359,7 +363,7 @@ class DriveSettings:
     run: str | Sequence[str]
     world: str = "rpi"
     others: str | Sequence[str] | None = None
-    ways: str | Sequence[Literal["own", "warm", "alone", "respond"]] = ("own", "warm", "alone", "respond")
+    ways: Way | Sequence[Way] = ("own", "warm", "alone", "respond")
     baselines: str | Sequence[str] | None = None
     mode: Literal["likely", "nearest"] = "likely"
     episodes: int = 500

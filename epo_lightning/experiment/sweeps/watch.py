@@ -222,5 +222,5 @@ def news(sweep: Sweep) -> Iterator[None]:
         yield
     finally:
         over.set()
-        watcher.join(timeout=POLL)
-        look()
+        watcher.join()
+    look()
