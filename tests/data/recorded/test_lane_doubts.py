@@ -41,13 +41,16 @@ def test_points_in_another_order_are_named(name: str) -> None:
     assert f"the {name} line of lane {lanes.ids[4]}: are their points in the order of driving?" in doubt
 
 
-def test_two_exchanged_points_are_seen_and_hairpins_and_tiny_hooks_are_not() -> None:
+def test_two_exchanged_points_are_seen_and_hairpins_right_angles_and_tiny_hooks_are_not() -> None:
     lanes = road(curve(None))
     straight = np.stack([np.arange(9.0), np.zeros(9)], 1)
     exchanged = straight[[0, 1, 2, 4, 3, 5, 6, 7, 8]]
     hairpin = np.concatenate([straight, straight[::-1] + np.array([0.0, 0.3])])[[*range(9), *range(10, 18)]]
-    hooks = np.concatenate([straight[:3], straight[2:3] - [0.01, 0.0], straight[3:5], straight[4:5] - [0.01, 0.0]])
-    for line, found in ((straight, 0), (exchanged, 1), (hairpin, 0), (hooks, 0)):
+    hooks = np.concatenate(
+        [straight[:3], straight[2:3] - [0.01, 0.0], straight[3:5], straight[4:5] - [0.01, 0.0], straight[5:]]
+    )
+    stairs = np.repeat(np.arange(9.0), 2)[np.arange(8)[:, None] + [1, 0]]  # right angles to the left and to the right
+    for line, found in ((straight, 0), (exchanged, 1), (hairpin, 0), (hooks, 0), (stairs, 0)):
         assert len(doubts_of_lanes(dataclasses.replace(lanes, centre=[line, *lanes.centre[1:]]))) == found
 
 
