@@ -11,10 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from epo_lightning.data.errors import RecordingError
-from epo_lightning.data.recorded.lanes import LaneGraph, Polylines, lane_changes
+from epo_lightning.data.recorded.lanes import LaneGraph, Located, Polylines, lane_changes
 from epo_lightning.data.recorded.routes import Routes
 from epo_lightning.data.simulate.leaders import leaders
 
+from .crossings import graph
 from .roads import FOUR, WIDTH, curve, road, traffic
 
 
@@ -87,8 +88,42 @@ def test_agents_are_found_on_their_lanes_wherever_the_road_lies(radius, turn, se
 
 def test_agents_heading_against_a_lane_or_beside_the_road_are_on_no_lane():
     lanes = road(curve(None))
-    position = np.array([[50.0, 0.0], [50.0, -2.5], [50.0, -3.5], [50.0, 0.0]])
-    assert lanes.locate(position, np.array([np.pi, 0.0, 0.0, 0.3])).lane.tolist() == [-1, 0, -1, 0]
+    cases = [  # y [m] and heading [rad] at x = 50 m, and the lane
+        *((0.0, 0.3, 0), (0.0, np.pi, -1), (-2.5, 0.0, 0), (-3.5, 0.0, -1)),
+        *((0.0, 1.5, 0), (0.0, 1.65, -1), (0.0, -1.5, 0), (-2.5, 1.65, -1), (WIDTH, 0.3, 1)),
+    ]
+    y, heading, lane = np.array(cases).T
+    found = lanes.locate(np.stack((np.full(len(y), 50.0), y), -1), heading)
+    assert found.lane.tolist() == lane.tolist()
+    np.testing.assert_allclose(found.offset, np.where(lane < 0, 0.0, y - lane * WIDTH), atol=1e-9)
+
+
+@pytest.mark.parametrize(("offset", "heading", "lane"), [(0.0, 0.2, 0), (-0.8, 0.2, 1), (-0.8, 0.0, 0), (-1.3, 0.0, 1)])
+def test_where_lanes_overlap_a_radian_counts_as_much_as_five_metres(offset, heading, lane):
+    """The second lane is 1.5 m to the right of the first one at x = 0, and turned to the left by 0.2 radians."""
+    direction = np.array([np.cos(0.2), np.sin(0.2)])
+    lines = [np.array([[-80.0, 0.0], [80.0, 0.0]]), np.array([[0.0, -1.5]]) + np.array([[-80.0], [80.0]]) * direction]
+    for order in (1, -1):
+        lanes = LaneGraph.from_centrelines(lines[::order], 8.0)
+        (found,) = lanes.locate(np.array([[0.0, offset]]), np.array([heading])).lane
+        assert found == (lane if order == 1 else 1 - lane)
+    twice = LaneGraph.from_centrelines([lines[lane]] * 3, 8.0)
+    assert twice.locate(np.array([[0.0, offset]]), np.array([heading])).lane.tolist() == [0], "the first of equal lanes"
+
+
+@pytest.mark.parametrize(("heading", "angle"), [(0.1, 1.0), (-0.1, 1.0), (0.9, 1.0), (1.1, 1.0), (0.1, 0.05)])
+@pytest.mark.parametrize("distance", [0.5, 2.0, 6.0])
+def test_lanes_around_a_position_are_those_within_a_distance_and_an_angle(heading, angle, distance):
+    lanes = road(curve(None), sections=1)
+    positions, headings = np.array([[10.0, 50.0], [50.0, 1.0]]), np.array([0.0, heading])
+    row, lane, along, cost = lanes.around(positions, headings, distance, angle)
+    away = [max(abs(1.0 - WIDTH * k) - WIDTH / 2, 0.0) for k in range(3)]  # from the borders of the lanes
+    expected = [k for k in range(3) if away[k] <= distance and abs(heading) < angle]
+    order = np.argsort(lane)
+    assert lane[order].tolist() == expected
+    assert (row == 1).all()
+    np.testing.assert_allclose(along, 50.0)
+    np.testing.assert_allclose(cost[order], [abs(1.0 - WIDTH * k) + 5.0 * abs(heading) for k in expected])
 
 
 def test_a_lane_change_is_the_first_row_on_the_lane_beside():
@@ -158,6 +193,36 @@ def test_changes_are_seen_on_lanelets_of_any_length(length):
     assert np.flatnonzero(lane_changes(np.zeros(50, int), found, lanes)).tolist() == [25]
 
 
+def changes(lanes: LaneGraph, *passed: int) -> list[int]:
+    """The rows in which an agent changes lane that is on these lanes, one after the other."""
+    nothing = np.zeros(len(passed))
+    return np.flatnonzero(
+        lane_changes(np.zeros(len(passed)), Located(np.array(passed), nothing, nothing), lanes)
+    ).tolist()
+
+
+def test_a_way_through_a_fork_is_no_lane_change_though_its_branches_are_neighbours():
+    """Lane 0 leads to the short lane 1, which forks into 2 and, on its left, 3; 4 follows 2."""
+    lines = [[[0, 0], [50, 0]], [[50, 0], [53, 0]], [[53, 0], [99, -3]], [[53, 0], [99, 3]], [[99, -3], [150, -3]]]
+    lanes = graph(lines, [(1,), (2, 3), (4,), (), ()], left=[-1, -1, 3, -1, -1], right=[-1, -1, -1, 2, -1])
+    assert changes(lanes, 0, 0, 1, 2, 4) == changes(lanes, 0, 1, 3, 3) == []
+    assert changes(lanes, 0, 2, 2) == changes(lanes, 0, 3) == changes(lanes, 0, 4) == [], "several lanes in one step"
+    assert changes(lanes, 0, 2, 3) == changes(lanes, 0, 3, 2) == [2]
+    assert changes(lanes, 3, 4) == [1], "from one branch to the lane after the other one"
+
+
+def test_changes_are_seen_across_markings_after_a_gap_and_where_lanes_part():
+    """Lanes 0 and, on its left, 1 lead to 2 and 3, which are not beside each other; 4 is another road."""
+    lines = [[[0, 0], [50, 0]], [[0, 4], [50, 4]], [[50, 0], [99, -30]], [[50, 4], [99, 30]], [[0, -9], [50, -9]]]
+    lanes = graph(lines, [(2,), (3,), (), (), ()], left=[1, -1, -1, -1, -1], right=[-1, 0, -1, -1, -1])
+    lanes = dataclasses.replace(lanes, left_of=np.full(5, -1), right_of=np.full(5, -1))  # a line not to be crossed
+    assert changes(lanes, 0, 0, 1, 1, 0) == [2, 4]
+    assert changes(lanes, 0, -1, 1) == changes(lanes, -1, 0, 1) == [2], "rows on no lane are ignored"
+    assert changes(lanes, 0, -1, 0, -1) == []
+    assert changes(lanes, 2, 3) == changes(lanes, 3, 2) == [1], "the lanes before were neighbours"
+    assert changes(lanes, 0, 4, 2) == [], "a road that is not beside, such as that below a bridge"
+
+
 def test_routes_on_a_loop_start_at_the_agent():
     """A lane that leads into a ring and over its own beginning."""
     angles = np.linspace(-np.pi / 2, np.pi, 60)
@@ -195,11 +260,21 @@ def test_routes_on_a_loop_start_at_the_agent():
 
 def test_invalid_lane_graphs_are_refused():
     lanes = road(curve(None))
+    beside = ("left_of", "right_of", "adjacent_left", "adjacent_right")
+    absent = (-2, len(lanes))
     for change, message in (
-        ({"successors": [(99,)] * len(lanes)}, "names a successor that does not exist"),
-        ({"left_of": np.full(len(lanes), 99)}, "names a neighbouring lane that does not exist"),
-        ({"centre": [line[:1] for line in lanes.centre]}, "has no length"),
+        *(
+            ({"successors": [(lane,)] * len(lanes)}, "names a successor that does not exist")
+            for lane in (-1, len(lanes))
+        ),
+        *(
+            ({name: np.full(len(lanes), lane)}, "names a neighbouring lane that does not exist")
+            for name in beside
+            for lane in absent
+        ),
+        *(({"centre": [line[:few] for line in lanes.centre]}, "has no length") for few in (0, 1)),
         ({"left": [line * np.nan for line in lanes.left]}, "are not finite or beyond"),
+        ({"right": [line * 1e5 for line in lanes.right]}, "the right line of lane .* beyond .* m: are they in metres"),
     ):
         with pytest.raises(RecordingError, match=message):
             dataclasses.replace(lanes, **change).check("map.osm")

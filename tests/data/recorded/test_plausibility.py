@@ -74,7 +74,9 @@ def test_agents_that_accelerate_between_frames_are_not_doubted() -> None:
     turned = dataclasses.replace(tracks, heading=tracks.heading + math.pi)
     for mistaken in (wrong, turned):
         for rows, doubted in ((38, False), (40, True)):
-            few = {name: getattr(mistaken, name)[:rows] for name in ("agent", "frame", "position", "heading", "velocity")}
+            few = {
+                name: getattr(mistaken, name)[:rows] for name in ("agent", "frame", "position", "heading", "velocity")
+            }
             assert bool(doubts(dataclasses.replace(mistaken, **few))) == doubted, "19 steps are too few, and 20 are not"
 
 

@@ -45,6 +45,7 @@ def test_lanes_from_centrelines_are_those_with_their_borders(radius: float | Non
         ([LINES[0], LINES[1][::-1]], {"left_of": [1, -1]}, "left_of of lane 0 is 1, which is not to its left"),
         ([*LINES, LINES[0]], {"left_of": [1, -1, 1]}, "lanes 0 and 2 have the same left neighbour"),
         (LINES, {"width": -3.5}, "width is -3.5, expected a positive number"),
+        (LINES, {"width": np.inf}, "width is inf, expected a positive number"),
         (LINES, {"width": np.nan}, "width is nan, expected a positive number"),
         (LINES, {"speed_limit": 0.0}, "speed_limit is 0.0, expected a positive number"),
         (LINES, {"successors": [(5,), ()]}, "a lane names a successor that does not exist"),
@@ -60,6 +61,18 @@ def test_lanes_keep_their_width_at_corners_and_repeated_points() -> None:
     made = LaneGraph.from_centrelines([corner], 4.0)
     assert made.left[0].tolist() == [[0.0, 2.0], [48.0, 2.0], [48.0, 50.0]]
     assert made.right[0].tolist() == [[0.0, -2.0], [52.0, -2.0], [52.0, 50.0]]
+
+
+def test_borders_stay_near_a_hairpin() -> None:
+    for back in (0.0, 0.01, 5.0):
+        made = LaneGraph.from_centrelines([np.array([[0.0, 0.0], [50.0, 0.0], [0.0, back]])], 4.0)
+        for side in (made.left[0], made.right[0]):
+            assert np.linalg.norm(side - made.centre[0], axis=1).max() < 4.0, "a sharp corner is cut"
+
+
+def test_a_lane_may_begin_on_the_line_of_its_left_neighbour() -> None:
+    lane = np.concatenate([LINES[1][:1], LINES[0][3:]])
+    assert LaneGraph.from_centrelines([lane, LINES[1]], WIDTH, left_of=[1, -1]).right_of.tolist() == [-1, 0]
 
 
 def vehicles(*now: tuple[float, float, float]) -> np.ndarray:
