@@ -158,6 +158,7 @@ def test_bends_that_a_fast_vehicle_cannot_take_come_last():
     lines = whole.candidates[0].reshape(12, PER_LINE, 2)
     assert (np.abs(lines[:3, :, 1]) <= WIDTH / 2 + 1e-9).all(), "straight on and its boundaries come first"
     assert (np.abs(lines[3 : whole.count[0], -1, 1]) > 20).all(), "the others are used where there are lines to spare"
+    assert (whole.references[0, whole.count[0] :] == whole.references[0, 0]).all()
     assert (fast.candidates[0, :, 1] == 0).all()
     assert slow.count.tolist() == [1]
 

@@ -206,7 +206,7 @@ def test_a_way_through_a_fork_is_no_lane_change_though_its_branches_are_neighbou
     lines = [[[0, 0], [50, 0]], [[50, 0], [53, 0]], [[53, 0], [99, -3]], [[53, 0], [99, 3]], [[99, -3], [150, -3]]]
     lanes = graph(lines, [(1,), (2, 3), (4,), (), ()], left=[-1, -1, 3, -1, -1], right=[-1, -1, -1, 2, -1])
     assert changes(lanes, 0, 0, 1, 2, 4) == changes(lanes, 0, 1, 3, 3) == []
-    assert changes(lanes, 0, 2, 2) == changes(lanes, 0, 3) == changes(lanes, 0, 4) == [], "several lanes in one step"
+    assert changes(lanes, 0, 2, 2) == changes(lanes, 0, 3) == changes(lanes, 1, 4) == [], "several lanes in one step"
     assert changes(lanes, 0, 2, 3) == changes(lanes, 0, 3, 2) == [2]
     assert changes(lanes, 3, 4) == [1], "from one branch to the lane after the other one"
 
