@@ -21,7 +21,7 @@ def test_lines_that_are_less_than_a_metre_apart_are_the_same(apart, count):
     assert found.tolist() == [count]
 
 
-@pytest.mark.parametrize(("speed", "sharp"), [(9.5, False), (10.5, True), (0.0, False)])
+@pytest.mark.parametrize(("speed", "sharp"), [(9.9, False), (10.1, True), (0.0, False)])
 def test_a_bend_of_twenty_metres_is_taken_with_ten_metres_per_second(speed, sharp):
     angle = np.linspace(0.0, 1.5, PER_LINE)
     points = 20.0 * np.stack([np.sin(angle), 1 - np.cos(angle)], 1)

@@ -24,7 +24,6 @@ from epo_lightning.data.recorded.lanes import SHOULDER, LaneGraph
 from epo_lightning.data.recorded.routes import BEHIND, BRAKING, PER_LINE, Routes, reach
 from epo_lightning.data.recorded.scenes import RecordedScenes
 from epo_lightning.data.recorded.summary import distance_to_goals
-from epo_lightning.data.recorded.surroundings import reachable_pieces
 from epo_lightning.data.recorded.windows import WindowConfig, extract, identifying
 from epo_lightning.registry import ConfigError
 
@@ -278,27 +277,6 @@ def test_distances_to_goals_are_those_to_the_candidates_of_lines_that_exist():
         for agent, count in enumerate(scenes.lines)
     ]
     np.testing.assert_allclose(distance_to_goals(scenes), expected)
-
-
-def test_lanes_within_reach_equal_a_plain_loop():
-    random = np.random.default_rng(0)
-    lines = random.uniform(-200, 200, (40, 1, 2)) + random.uniform(-9, 9, (40, 11, 2))
-    position, far = random.uniform(-200, 200, (12, 2)), random.uniform(10, 120, 12)
-    members = random.integers(-1, 12, (9, 3))
-    centre = random.uniform(-200, 200, (9, 2))
-    found = reachable_pieces(lines, position, far, members, centre)
-    for scene in range(9):
-        expected = [
-            line
-            for line in sorted(range(40), key=lambda line: np.linalg.norm(lines[line, 5] - centre[scene]))
-            if any(
-                np.linalg.norm(point - position[agent]) <= far[agent]
-                for agent in members[scene]
-                if agent >= 0
-                for point in lines[line]
-            )
-        ]
-        assert found[scene][found[scene] >= 0].tolist() == expected
 
 
 def test_settings_of_junctions_enter_the_identity_of_a_data_set_only_where_they_are_used():

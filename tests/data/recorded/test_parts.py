@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from hypothesis import strategies as st
 
 from epo_lightning.data.recorded import parts as parts_module
 from epo_lightning.data.recorded.extraction import Extracted, outcomes
-from epo_lightning.data.recorded.gathering import Spool, gather
+from epo_lightning.data.recorded.gathering import Spool, gather, gathered
 from epo_lightning.data.recorded.parts import Parts
 from epo_lightning.data.recorded.recordings import RecordedData
 from epo_lightning.data.recorded.tables import INDEX_OF, OF_AGENTS, OF_SCENES, SceneTables, joined, selected
@@ -264,6 +265,35 @@ def test_gathered_columns_are_those_joined_in_memory(tmp_path_factory, seed, emp
     counts = [(row >= 0).sum() for part in full for row in part.agents]
     assert about["agents per scene"] == float(np.mean(counts))
     assert set(INDEX_OF.values()) == {"history", "polylines", "origin"}
+
+
+def test_scenes_are_gathered_in_files_that_exist_as_long_as_they_are_used(tmp_path):
+    draw = np.random.default_rng(0)
+    lanes = {"a": 2, "b": 5, "c": 3, "d": 4}
+    found = {name: tables(draw, count, True) for name, count in lanes.items()} | {"none": None}
+    counts = {name: {"scenes": 0 if part is None else len(part)} for name, part in found.items()}
+    outcome = {"a": (3, 1), "b": (5, 3), "c": (0, 0), "d": (7, 7), "none": (0, 0)}
+    extracted = {
+        name: Extracted({}, {"moving agents": moving, "ends far from lanes": far} if moving else {})
+        for name, (moving, far) in outcome.items()
+    }
+    parts = SimpleNamespace(folder=tmp_path, lanes=lanes.__getitem__)  # only these are asked for their lanes
+    splits = {"train": ["a", "none", "b"], "val": ["c"], "test": ["d"]}
+    folder = tmp_path / "columns"
+    (folder / "train").mkdir(parents=True)  # as a killed process leaves it
+    (folder / "train" / "agents").write_text("half")
+    with (
+        pytest.raises(RuntimeError, match="while they are used"),
+        gathered(splits, found, counts, extracted, parts) as made,
+    ):
+        tensors, about = made
+        assert folder.is_dir()
+        assert {split: rows["lanes"].shape[1] for split, rows in tensors.items()} == {"train": 5, "val": 3, "test": 4}
+        share = "moving agents that end over 10 m from all lanes given"
+        assert {split: shown.get(share) for split, shown in about.items()} == {"train": 0.5, "val": None, "test": 1.0}
+        assert about["train"]["scenes"] == len(found["a"]) + len(found["b"])
+        raise RuntimeError("while they are used")
+    assert not folder.exists()
 
 
 def test_rows_of_another_shape_or_dtype_are_refused(tmp_path):

@@ -20,7 +20,6 @@ from epo_lightning.data.recorded import summary
 from epo_lightning.data.recorded.extraction import extract_to_file
 from epo_lightning.data.recorded.recordings import RecordedData
 from epo_lightning.data.recorded.splits import SplitRule
-from epo_lightning.data.recorded.surroundings import FAR, MOVING, far_from_lanes
 from epo_lightning.data.recorded.tables import joined, selected
 from epo_lightning.data.recorded.tracks import RecordingSource
 from epo_lightning.data.recorded.windows import WindowConfig, extract
@@ -304,22 +303,6 @@ def test_splits_are_disjoint_and_complete(groups, seed, val_by):
     assert sorted(names) == sorted(source.name for source in sources)
     tested = {source.group for source in found["test"]}
     assert not tested & {source.group for part in ("train", "val") for source in found[part]}
-
-
-def test_ends_far_from_all_lanes_equal_a_plain_loop():
-    of = recording(vehicles=((1, 5.0, 0, 22.0, 1.0), (2, 60.0, 1, 25.0, None), (3, 400.0, 2, 33.0, None)), seconds=9.0)
-    config = WindowConfig(agents=3, least_agents=1, radius=None, lane_change=False, lanes=3)
-    scenes, _ = extract(of, config)
-    far = total = 0
-    for members, lanes in zip(scenes.agents, scenes.lanes, strict=True):
-        points = np.concatenate([scenes.polylines[lane] for lane in lanes if lane >= 0])
-        for row in members:
-            if row < 0 or np.linalg.norm(scenes.future[row, -1, :2] - scenes.history[row, -1, :2]) <= MOVING:
-                continue
-            total += 1
-            far += min(np.linalg.norm(points - scenes.future[row, -1, :2], axis=1)) > FAR
-    assert far_from_lanes(scenes) == (far, total)
-    assert 0 < far < total
 
 
 def test_selected_scenes_are_the_same_scenes_with_their_own_agents_only():
