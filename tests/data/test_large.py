@@ -136,6 +136,31 @@ def test_scenes_of_a_large_split_are_read_ahead_of_their_batches_and_are_the_sam
     assert torch.equal(torch.cat(list(in_order)), torch.arange(len(data)))
 
 
+@pytest.mark.parametrize(("first", "last"), [(0, 0), (3, 9), (17, 17), (40, -1)])
+def test_all_rows_of_the_scenes_that_are_read_ahead_are_asked_for_and_no_others(columns, monkeypatch, first, last):
+    asked: dict[str, set[int]] = {}
+
+    def ask(piece: torch.Tensor) -> None:
+        (name,) = (name for name, tensor in columns.items() if tensor.data_ptr() <= piece.data_ptr() < end_of(tensor))
+        begin = (piece.data_ptr() - columns[name].data_ptr()) // columns[name][:1].nbytes
+        asked.setdefault(name, set()).update(range(begin, begin + len(piece)))
+
+    def end_of(tensor: torch.Tensor) -> int:
+        return tensor.data_ptr() + tensor.nbytes
+
+    columns["lanes"][17] = -1  # a scene without lanes
+    scenes = list(range(first, last + 1 if last >= 0 else len(columns["agents"])))
+    monkeypatch.setattr(scenes_module, "read_ahead", ask)
+    RecordedScenes(columns, 0.2, "aligned", [""] * 40).read_ahead(scenes[0], scenes[-1])
+    rows = {name: [row for row in columns[name][scenes].flatten().tolist() if row >= 0] for name in ("agents", "lanes")}
+    between = {name: set(range(min(used), max(used) + 1)) if used else set() for name, used in rows.items()}
+    of_agents = ("history", "history_mask", "future", "future_mask", "size", "kind", "track")
+    of_agents += ("candidates", "references", "reference_speed", "lines")
+    expected = {name: set(scenes) for name in ("agents", "lanes", "centre", "direction", "recording", "frame")}
+    expected |= {"polylines": between["lanes"], **dict.fromkeys(of_agents, between["agents"])}
+    assert asked == {name: wanted for name, wanted in expected.items() if wanted}
+
+
 @pytest.mark.usefixtures("large")
 def test_a_share_of_a_large_split_is_read_in_blocks(tmp_path, columns, monkeypatch):
     data = RecordedScenes(cache.load(written(tmp_path, columns), "train"), 0.2, "aligned", [""] * 40)
@@ -146,9 +171,14 @@ def test_a_share_of_a_large_split_is_read_in_blocks(tmp_path, columns, monkeypat
         assert set(share.chosen[indices].tolist()) <= asked
 
 
-def test_a_small_split_is_shuffled_as_a_whole(columns):
+def test_a_small_split_is_shuffled_as_a_whole(columns, monkeypatch):
     data = RecordedScenes(columns, 0.2, "aligned", [""] * 40)
     assert data.block is None
+    size = sum(tensor.nbytes for tensor in columns.values())
+    for limit, block in ((size, 10), (size + 1, None)):
+        monkeypatch.setattr(scenes_module, "LARGE", limit)
+        monkeypatch.setattr(scenes_module, "BLOCK", size * 10 // len(data) + 1)
+        assert RecordedScenes(columns, 0.2, "aligned", [""] * 40).block == block
     order = torch.cat(list(BatchSampler(data, 1, shuffle=True, seed=5)))
     assert torch.equal(order, torch.randperm(len(data), generator=epoch_generator(5, 0)))
 

@@ -294,6 +294,11 @@ def test_scenes_are_gathered_in_files_that_exist_as_long_as_they_are_used(tmp_pa
         assert about["train"]["scenes"] == len(found["a"]) + len(found["b"])
         raise RuntimeError("while they are used")
     assert not folder.exists()
+    parts.folder = tmp_path / "file"
+    parts.folder.touch()
+    refused = gathered(splits, found, counts, extracted, parts)
+    with pytest.raises(OSError, match=r"cannot write .*: set data.root to a folder that can be written"), refused:
+        pass
 
 
 def test_rows_of_another_shape_or_dtype_are_refused(tmp_path):

@@ -53,17 +53,18 @@ def test_lanes_within_reach_equal_a_plain_loop() -> None:
 
 def test_moving_agents_that_end_more_than_ten_metres_from_all_lanes_equal_a_plain_loop() -> None:
     draw = np.random.default_rng(0)
-    end, way = draw.uniform(-30, 30, (40, 2)), draw.uniform(-1, 1, (40, 2))
+    end, way = draw.uniform(-15, 15, (40, 2)), draw.uniform(-1, 1, (40, 2))
+    way[-1] = 0.9  # the last agent moves: it must not count where a scene has no agent
     history, future = draw.normal(size=(40, 3, 4)), draw.normal(size=(40, 2, 4))
     future[:, -1, :2], history[:, -1, :2] = end, end - way
     scenes = dataclasses.replace(
         tables(draw, 3, False),
         history=history,
         future=future,
-        future_mask=draw.random((40, 2)) < 0.7,
-        polylines=draw.uniform(-30, 30, (25, 1, 2)) + draw.uniform(-4, 4, (25, 5, 2)),
-        agents=draw.integers(-1, 40, (51, 4)),
-        lanes=draw.integers(-1, 25, (51, 3)),
+        future_mask=(draw.random((40, 2)) < 0.7) | (np.arange(40)[:, None] == 39),
+        polylines=draw.uniform(-60, 60, (25, 1, 2)) + draw.uniform(-4, 4, (25, 5, 2)),
+        agents=draw.integers(-1, 40, (49, 4)),
+        lanes=draw.integers(-1, 25, (49, 3)),
     )
     far = moving = 0
     for members, lanes in zip(scenes.agents, scenes.lanes, strict=True):
@@ -74,5 +75,5 @@ def test_moving_agents_that_end_more_than_ten_metres_from_all_lanes_equal_a_plai
                 far += all(np.hypot(*(point - end[agent])) > 10.0 for point in points)
     assert far_from_lanes(scenes) == (far, moving)
     assert 0 < far < moving
-    without = dataclasses.replace(scenes, polylines=scenes.polylines[:0], lanes=np.full((51, 0), -1))
+    without = dataclasses.replace(scenes, polylines=scenes.polylines[:0], lanes=np.full((49, 0), -1))
     assert far_from_lanes(without) == (0, 0), "there is no map"

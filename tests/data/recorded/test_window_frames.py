@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -68,6 +69,13 @@ def test_agents_that_head_against_each_other_are_aligned_with_the_focal_one():
         )
         scene, _ = scenes_of(dataclasses.replace(of, tracks=turned, lanes=None), config, "aligned")
         torch.testing.assert_close(scene.current[:, 0, 2], torch.zeros(len(scene.history)), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("turn", [np.pi - 0.02, np.pi, 0.02 - np.pi, 7.0])
+def test_aligned_headings_are_small_wherever_the_road_leads(turn):
+    """Headings on both sides of half a turn, in the axes of the recording, are near each other in those of the scene."""
+    scene, _ = scenes_of(recording(curve(None, turn)), frame="aligned")
+    assert 0.05 < scene.history[..., 2].abs().max() < 0.5
 
 
 def test_headings_begin_within_half_a_turn_and_go_on_without_a_jump():

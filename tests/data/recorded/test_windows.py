@@ -281,6 +281,7 @@ def test_scenes_belong_to_the_subset_of_their_definition(shape, frame):
     again = RecordedScenes(columns, 0.2, frame, [of.name], shape)
     mixed = torch.arange(len(data)).flip(0)[::3]
     assert again[mixed].subset.tolist() == again[mixed].subset.tolist() == whole.subset[mixed].tolist()
+    assert again[torch.arange(len(data))].subset.tolist() == expected, "some of the scenes were read before"
     assert RecordedScenes(columns, 0.2, frame, [of.name])[mixed].subset is None
 
 

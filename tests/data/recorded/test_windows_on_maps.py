@@ -44,6 +44,16 @@ def test_pieces_of_lanes_have_vectors_of_six_metres_at_most():
     assert 5.0 < length.max() <= 6.0
 
 
+def test_vectors_of_lanes_lead_from_one_to_the_next_in_the_direction_of_driving():
+    scene, _ = scenes_of(recording(vehicles=THREE), dataclasses.replace(ALL, lanes=64))
+    assert 0 < scene.lane_mask.float().mean() < 1, "absent lanes are padded"
+    start, end = scene.lanes[..., :2], scene.lanes[..., 2:]
+    assert torch.equal(start[:, :, 1:], end[:, :, :-1])
+    there = scene.lane_mask
+    assert ((end - start)[there][:, 0] > 4.9).all(), "the road leads along x"
+    assert (scene.lanes[~there] == 0).all()
+
+
 def test_without_a_number_of_lanes_a_scene_has_those_on_which_its_agents_may_be_and_some_more():
     of = recording(vehicles=[(1, 20.0, 0, 8.0, None)], seconds=7.0)
     config = WindowConfig(agents=1, least_agents=1, lane_change=False, lanes=None)
@@ -128,5 +138,14 @@ def test_kinds_and_sizes_are_those_of_the_agents_and_zero_for_none():
             scene.size[row, agents].double(), torch.from_numpy(of.tracks.size), rtol=0, atol=1e-6
         )
     assert not scene.agent_mask[:, 3].any()
-    for name in ("kind", "size", "reference_speed"):
+    for name in (
+        "kind",
+        "size",
+        "reference_speed",
+        "history",
+        "future",
+        "history_mask",
+        "goal_candidates",
+        "references",
+    ):
         assert (getattr(scene, name)[:, 3] == 0).all()
