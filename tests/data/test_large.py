@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import mmap
 import os
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -50,6 +52,24 @@ def test_mapped_tensors_are_those_of_the_package(tmp_path, columns):
         read_ahead(found[name][1:])
 
 
+def test_the_system_is_asked_for_all_pages_of_a_piece_and_for_none_of_an_empty_one(tmp_path, columns, monkeypatch):
+    file = mapped(written(tmp_path, columns) / "train.safetensors", ["history", "kind"])
+    asked: list[tuple[int, int, int]] = []
+    system = SimpleNamespace(madvise=lambda begin, size, advice: asked.append((begin.value, size.value, advice)))
+    monkeypatch.setattr("epo_lightning.data.mapped.ctypes.CDLL", lambda _: system)
+    for piece in (file["history"][2:5], file["kind"][1:], file["history"]):
+        read_ahead(piece)
+        begin, size, advice = asked.pop()
+        assert begin % mmap.PAGESIZE == 0
+        assert 0 <= piece.data_ptr() - begin < mmap.PAGESIZE
+        assert begin + size == piece.data_ptr() + piece.numel() * piece.element_size()
+        assert advice == mmap.MADV_WILLNEED
+    read_ahead(file["history"][:0])
+    assert not asked
+    del system.madvise
+    read_ahead(file["history"])  # a system without this call
+
+
 @pytest.mark.usefixtures("large")
 def test_a_large_file_is_checked_once_and_again_when_it_changes(tmp_path, columns, monkeypatch):
     folder = written(tmp_path, columns)
@@ -82,9 +102,9 @@ def test_numbers_are_checked_piece_by_piece(monkeypatch):
     monkeypatch.setattr("epo_lightning.data.mapped.PIECE", 24)
     values = torch.zeros(11, 3)
     assert not_finite(values) == (0, -1)
-    values[4, 1] = values[4, 2] = values[9, 0] = torch.nan
-    assert not_finite(values) == (2, 4)
-    assert not_finite(values[:, 0]) == (1, 9)
+    values[4, 1] = values[4, 2] = values[5, 0] = values[9, 0] = torch.nan
+    assert not_finite(values) == (3, 4)
+    assert not_finite(values[:, 0]) == (2, 5)
     assert not_finite(torch.zeros(0, 3)) == (0, -1)
 
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from epo_lightning.data.drawn import DrawnData
-from epo_lightning.data.open_space import CURVES, ON_FOOT, OpenSpace, in_open_space
+from epo_lightning.data.open_space import OpenSpace, in_open_space
 from epo_lightning.experiment.assembly import build_model
 from epo_lightning.experiment.config.compose import compose
 from epo_lightning.experiment.config.settings import Settings
@@ -36,16 +36,18 @@ def one(speed: float, heading: float, kind: str) -> Scene:
     )
 
 
-@given(st.floats(0, 35), st.floats(-3, 3), st.sampled_from(["car", "pedestrian"]))
+@given(st.floats(-2, 35), st.floats(-3, 3), st.sampled_from(["car", "pedestrian"]))
 def test_candidates_are_driven_by_small_steps(speed: float, heading: float, kind: str) -> None:
     scene = in_open_space(one(speed, heading, kind))
-    found = scene.goal_candidates[0, 0].view(len(CURVES), 20, 2).double()
-    limit, time = (ON_FOOT if kind == "pedestrian" else 3.0), 4.0
+    found = scene.goal_candidates[0, 0].view(7, 20, 2).double()
+    limit, time = (1.0 if kind == "pedestrian" else 3.0), 4.0
+    speed = max(speed, 0.0)  # an agent that rolls backwards stops
+    assert scene.reference_speed.item() == pytest.approx(speed)
     far = speed * time + limit * time * time / 2
     brake = min(speed / 4.0, time)
     near = max(0.0, min(speed * brake - 2.0 * brake * brake, far - 10.0))
     largest = min(limit / speed**2 if speed > 1e-3 else math.inf, math.pi / far)
-    for number, share in enumerate(CURVES):
+    for number, share in enumerate((1.0, 4 / 9, 1 / 9, 0.0, -1 / 9, -4 / 9, -1.0)):  # from left to right
         for place in (0, 7, 19):
             length = near + (far - near) * place / 19
             x, y, angle, step = 3.0, -2.0, heading, length / 2000
@@ -81,6 +83,14 @@ def test_the_map_is_empty_and_nothing_else_changes() -> None:
     assert after.finite.all()
     road = DrawnData("highway", scenes=2).open("test")[torch.arange(2)]
     assert in_open_space(road) is road
+
+
+def test_padding_of_absent_agents_is_not_read() -> None:
+    scene = walkers()
+    assert not scene.agent_mask.all()
+    padded = dataclasses.replace(scene, history=scene.history.masked_fill(~scene.agent_mask[..., None, None], math.nan))
+    for name in ("goal_candidates", "reference_speed"):
+        assert torch.equal(getattr(in_open_space(padded), name), getattr(in_open_space(scene), name))
 
 
 def test_candidates_do_not_depend_on_the_future() -> None:
@@ -142,7 +152,10 @@ def test_rows_of_roads_forecast_in_open_space(row: str) -> None:
 def test_a_data_set_keeps_its_order_and_provenance() -> None:
     whole = DrawnData("pedestrians", scenes=5).open("test")
     opened = OpenSpace(whole)
+    epochs: list[int] = []
+    whole.set_epoch = epochs.append
     opened.set_epoch(3)
+    assert epochs == [3]
     assert len(opened) == 5
     assert opened[torch.tensor([3, 1])].id.tolist() == [3, 1]
     assert opened.provenance([2]) == whole.provenance([2])
