@@ -80,6 +80,20 @@ def test_vehicles_rarely_begin_within_each_other_and_some_change_lane():
     assert (scene.goal_candidates - last).norm(dim=-1).amin(-1).median() < 5.0
 
 
+def test_goals_and_lines_of_drawn_vehicles_lie_on_three_lanes_and_as_far_as_they_brake_or_accelerate():
+    scene = drawn("highway", agents=12, scenes=16)
+    now = scene.current.double()
+    x, pace = now[..., 0, None], (now[..., 3] * now[..., 2].cos())[..., None]
+    goals, lines = scene.goal_candidates.double().unflatten(2, (3, 20)), scene.references.double()
+    for points, first, last in ((goals, 4 * pace - 32.0, 4 * pace + 24.0), (lines, -5.0 + 0 * pace, 4 * pace + 34.0)):
+        for place, far in ((0, first), (-1, last)):
+            torch.testing.assert_close(points[..., place, 0] - x, far.expand(-1, -1, 3), rtol=0, atol=1e-3)
+        assert (points[..., 1].diff(dim=2) == -3.5).all(), "from left to right, one lane apart"
+        own = points[:, :, 1, :, 1]
+        assert set(own.flatten().tolist()) == {0.0, 3.5, 7.0, 10.5}
+        assert (own[..., 0] - now[..., 1]).abs().max() <= 3.5
+
+
 def test_scenes_depend_on_the_seed_and_the_split():
     one, again, other, later = (
         drawn("highway", split, seed=seed).history

@@ -146,15 +146,16 @@ def test_tracks_may_begin_and_end_at_any_time():
     kept = of.tracks.frame <= lives
     parts = {n: getattr(of.tracks, n)[kept] for n in ("agent", "frame", "position", "heading", "velocity")}
     of = dataclasses.replace(of, tracks=dataclasses.replace(of.tracks, **parts))
-    for complete, lane_change in itertools.product((True, False), repeat=2):
-        config = WindowConfig(agents=5, least_agents=1, radius=None, lane_change=lane_change, complete=complete)
+    for agents, complete, lane_change in itertools.product((5, 3, 2), (True, False), (True, False)):
+        config = WindowConfig(agents=agents, least_agents=1, radius=None, lane_change=lane_change, complete=complete)
         scene, data = scenes_of(of, config)
         for index, entry in enumerate(data.provenance(range(len(data)))):
             present = scene.agent_mask[index].sum()
             assert present == len(entry["tracks"])
             last = {7: 500, 3: 500, 9: 400, 4: 350, 12: 150}
-            for track in entry["tracks"]:
-                assert entry["frame"] + (100 if complete else 0) <= last[track]
+            there = {track for track, frame in last.items() if entry["frame"] + (100 if complete else 0) <= frame}
+            assert set(entry["tracks"]) <= there
+            assert present == min(agents, len(there)), "nobody who is gone takes the place of a neighbour"
         assert scene.finite.all()
 
 
@@ -189,10 +190,13 @@ def test_neighbours_may_be_observed_in_part():
     part, data = scenes_of(of, WindowConfig(agents=4, least_agents=1, complete=False))
     seen = part.agent_mask.all(1)
     assert seen.any()
+    observed = set()
     for index in seen.nonzero().flatten().tolist():
         entry = data.provenance([index])[0]
         steps = part.history_mask[index, entry["tracks"].index(3)].sum()
         assert int(steps) == min(10, (entry["frame"] - 125) // 5 + 1)
+        observed.add(int(steps))
+    assert min(observed) == 2, "at the current step and at the one before"
     assert (part.history[~part.history_mask] == 0).all()
     assert part.finite.all()
 

@@ -193,10 +193,10 @@ def test_closed_starts_and_repeated_nodes_are_read(tmp_path):
     assert all((np.diff(line, axis=0) != 0).any(1).all() for line in (*after.left, *after.centre))
 
 
-@pytest.mark.parametrize(("noise", "share"), [(0.5, 1.0), (3.0, 0.95), (10.0, 0.95)])
+@pytest.mark.parametrize(("noise", "share"), [(0.0, 1.0), (0.5, 1.0), (3.0, 0.95), (10.0, 0.95)])
 def test_centrelines_of_irregular_boundaries_equal_those_of_lanelet2(noise, share):
-    """Boundaries that cross, turn back or fold over. A few of the worst depend on how the library rounds: whether the first
-    point of the centreline lies on the line between the first points of the bounds."""
+    """Straight ones along both axes, and those that cross, turn back or fold over. A few of the worst depend on how the
+    library rounds: whether the first point of the centreline lies on the line between the first points of the bounds."""
     library = pytest.importorskip("lanelet2", reason="there is no lanelet2 wheel for this Python").core
     random = np.random.default_rng(0)
 
@@ -204,11 +204,13 @@ def test_centrelines_of_irregular_boundaries_equal_those_of_lanelet2(noise, shar
         return library.LineString3d(id, [library.Point3d(10 * id + k, *point, 0.0) for k, point in enumerate(line)])
 
     same = []
-    for _ in range(400):
-        left, right = (
-            np.stack((np.linspace(0, 40, n), np.full(n, y)), 1) + random.normal(0, noise, (n, 2))
-            for n, y in zip(random.integers(2, 9, 2), (4.0, 0.0), strict=True)
-        )
+    for number in range(400):
+        lines = []
+        for n, y in zip(random.integers(2, 9, 2), (4.0, 0.0), strict=True):
+            x = np.linspace(0, 40, n) if noise else np.sort(random.uniform(0, 40, n))
+            line = np.stack((x, np.full(n, y)), 1) + random.normal(0, noise, (n, 2))
+            lines.append(line @ np.linalg.matrix_power([[0, 1], [-1, 0]], number % 4))
+        left, right = lines
         ours, theirs = centreline(left, right), points(library.Lanelet(1, drawn(left, 10), drawn(right, 20)).centerline)
         same.append(ours.shape == theirs.shape and np.abs(ours - theirs).max() < 1e-9)
     assert np.mean(same) >= share
