@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,7 @@ from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.compose import compose
 from epo_lightning.metrics.functional.overlap import overlapping_pairs
 from epo_lightning.registry import ConfigError
-from epo_lightning.scene import Scene
+from epo_lightning.scene import KINDS, Scene
 
 FIXTURE = Path(__file__).parents[1] / "fixtures" / "exid_sim"
 REAL = {
@@ -92,6 +93,26 @@ def test_goals_and_lines_of_drawn_vehicles_lie_on_three_lanes_and_as_far_as_they
         own = points[:, :, 1, :, 1]
         assert set(own.flatten().tolist()) == {0.0, 3.5, 7.0, 10.5}
         assert (own[..., 0] - now[..., 1]).abs().max() <= 3.5
+    torch.testing.assert_close(scene.reference_speed.double(), pace[..., 0] + 2.0, rtol=0, atol=1e-4)
+
+
+def test_drawn_lanes_are_a_road_of_four_lanes_and_trucks_are_long():
+    scene = drawn("highway", scenes=4)
+    for lanes in scene.lanes:
+        assert ((lanes[..., 2:] - lanes[..., :2]) == torch.tensor([6.0, 0.0])).all(), "along x"
+        pieces = sorted(zip(lanes[:, 0, 1].tolist(), lanes[:, 0, 0].tolist(), lanes[:, -1, 2].tolist(), strict=True))
+        assert [y for y, *_ in pieces] == [0.0] * 8 + [3.5] * 8 + [7.0] * 8 + [10.5] * 8
+        assert all(one[2] == other[1] for one, other in itertools.pairwise(pieces) if one[0] == other[0])
+    assert torch.equal(scene.size[..., 0] > 10.0, scene.kind == KINDS.index("truck"))
+
+
+def test_numbers_of_scenes_and_agents_are_those_that_were_asked_for():
+    """A record of RPI is two scenes."""
+    for count, scenes in ((1, 2), (5, 6), (6, 6)):
+        assert len(DrawnData("rpi", scenes=count).open("train")) == scenes
+        assert len(DrawnData("pedestrians", scenes=count).open("train")) == count
+    there = drawn("pedestrians", agents=6, scenes=64).agent_mask.sum(1)
+    assert set(there.tolist()) == {2, 3, 4, 5, 6}
 
 
 def test_scenes_depend_on_the_seed_and_the_split():
@@ -102,6 +123,9 @@ def test_scenes_depend_on_the_seed_and_the_split():
     assert torch.equal(one, again)
     assert not torch.equal(one, other)
     assert not torch.equal(one, later)
+    assert not torch.equal(other, drawn("highway", "val", seed=3).history), "seeds do not share their splits"
+    assert drawn("highway", "train").subset is None
+    assert drawn("highway", "test").subset is not None
     options = ({}, {"seed": 1}, {"scenes": 8}, {"agents": 3}, {"like": "rpi"})
     assert len({DrawnData(**each).digest for each in options}) == len(options)
     assert DrawnData(batch_size=8).digest == DrawnData().digest == DrawnData(agents=4).digest

@@ -18,7 +18,9 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from benchmarks import true_game
 from epo_lightning.data import cache
+from epo_lightning.data.rpi import generate
 from epo_lightning.data.rpi.scenes import RPIData
+from epo_lightning.data.rpi.solve import SETTINGS
 from epo_lightning.data.rpi.splits import PAPER_SIZES, assign, games_of
 
 SMALL = {"games": 3, "placements": 2, "seed": 1, "recipe": 2}
@@ -77,6 +79,32 @@ def test_a_broken_part_is_solved_again_and_a_made_set_is_left_alone(data, tmp_pa
     before = {path: path.stat().st_mtime_ns for path in other.folder.iterdir()}
     other.generate(workers=1, progress=False)
     assert {path: path.stat().st_mtime_ns for path in other.folder.iterdir()} == before
+
+
+def test_records_are_in_the_order_of_games_and_placements_whichever_are_solved_first(tmp_path, monkeypatch):
+    asked: list[tuple[int, int]] = []
+
+    def in_reverse(function, tasks, *_, **__):
+        for _, game, placement, *_ in reversed(tasks):
+            asked.append((game, placement))
+            values = {"game": np.full(2, game), "placement": np.full(2, placement)}
+            yield (0, game, placement), (values, {"solved": 1 + placement})
+
+    monkeypatch.setattr(generate, "finished", in_reverse)
+    config = generate.pool_config(0, 3, 2, next(iter(SETTINGS)), 2)
+    for _ in range(2):
+        records, counts = generate.make_pool(tmp_path, config, 1, False)
+        assert records["game"].tolist() == [0] * 4 + [1] * 4 + [2] * 4
+        assert records["placement"].tolist() == [0, 0, 1, 1] * 3
+        assert counts == {"solved": 3 * (1 + 2)}
+    assert asked == [(game, placement) for game in (2, 1, 0) for placement in (1, 0)], "nothing is solved twice"
+    asked.clear()
+    (file,) = tmp_path.glob("*/game-0001.safetensors")
+    content = bytearray(file.read_bytes())
+    content[-1] ^= 1
+    file.write_bytes(content)
+    generate.make_pool(tmp_path, config, 1, False)
+    assert asked == [(1, 1), (1, 0)], "a number was changed on the disk"
 
 
 def test_the_data_set_of_another_seed_is_refused(data, tmp_path):

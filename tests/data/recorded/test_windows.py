@@ -329,6 +329,14 @@ def test_invalid_window_settings_are_refused(key, value, message):
         WindowConfig(**{key: value})
 
 
+def test_a_lane_change_of_an_agent_elsewhere_does_not_count():
+    """Two pairs of vehicles, 300 m apart; the last vehicle of the recording changes lane."""
+    places = ((1, 0.0, 0), (2, 15.0, 1), (3, 300.0, 1), (4, 320.0, 0))
+    of = recording(vehicles=[(*place, 20.0, 2.0 if place[0] == 4 else None) for place in places])
+    _, data = scenes_of(of, WindowConfig(agents=3, least_agents=2))
+    assert {frozenset(entry["tracks"]) for entry in data.provenance(range(len(data)))} == {frozenset((3, 4))}
+
+
 @pytest.mark.parametrize(("radius", "found"), [(30.0, True), (29.99, False)])
 def test_a_neighbour_may_be_as_far_away_as_the_radius(radius, found):
     """Two vehicles that stand 30 m apart."""
