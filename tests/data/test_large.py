@@ -182,10 +182,11 @@ def test_all_rows_of_the_scenes_that_are_read_ahead_are_asked_for_and_no_others(
 
 
 @pytest.mark.usefixtures("large")
-def test_a_share_of_a_large_split_is_read_in_blocks(tmp_path, columns, monkeypatch):
+@pytest.mark.parametrize("part", [0.5, 0.97])  # in the second one, the last block is not full
+def test_a_share_of_a_large_split_is_read_in_blocks(tmp_path, columns, monkeypatch, part):
     data = RecordedScenes(cache.load(written(tmp_path, columns), "train"), 0.2, "aligned", [""] * 40)
-    share, asked = Share(data, 0.5), set()
-    assert share.block == round(data.block / 2)
+    share, asked = Share(data, part), set()
+    assert share.block == round(data.block * len(share) / len(data))
     monkeypatch.setattr(data, "read_ahead", lambda a, b: asked.update(range(a, b + 1)))
     for indices in BatchSampler(share, 2, shuffle=True, seed=0):
         assert set(share.chosen[indices].tolist()) <= asked

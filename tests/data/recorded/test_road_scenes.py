@@ -137,12 +137,64 @@ def test_vehicles_beside_the_road_and_wrong_shapes_are_named() -> None:
 
 def test_scenes_of_a_batch_are_those_of_their_own() -> None:
     make = RoadScenes(LaneGraph.from_centrelines(LINES, WIDTH, left_of=[1, -1]))
-    size, kind = np.full((1, 2, 2), [4.5, 1.9]), np.array([[0, 2]])
-    alone = [make(vehicles((x, 0.3, 20.0), (x + 20.0, WIDTH, 25.0)), size, kind=kind) for x in (0.0, 130.0)]
+    kind, sizes = np.array([[0, 2]]), np.array([[[4.5, 1.9], [5.0, 2.0]], [[12.0, 2.5], [6.0, 2.1]]])
+    alone = [
+        make(vehicles((x, 0.3, 20.0), (x + 20.0, WIDTH, 25.0)), size[None], kind=kind)
+        for x, size in zip((0.0, 130.0), sizes, strict=True)
+    ]
     histories = np.concatenate([vehicles((x, 0.3, 20.0), (x + 20.0, WIDTH, 25.0)) for x in (0.0, 130.0)])
-    both = make(histories, size.repeat(2, 0), kind=kind.repeat(2, 0))
+    both = make(histories, sizes, kind=kind.repeat(2, 0))
     for index, scene in enumerate(alone):
-        for name in ("history", "kind", "lanes", "goal_candidates", "references", "reference_speed", "frame"):
+        for name in ("history", "size", "kind", "lanes", "goal_candidates", "references", "reference_speed", "frame"):
             torch.testing.assert_close(getattr(both, name)[[index]], getattr(scene, name), rtol=0, atol=1e-4)
     assert both.kind is not None
     assert both.kind.tolist() == [[0, 2], [0, 2]]
+
+
+def test_the_first_vehicles_that_are_there_decide_on_the_frame() -> None:
+    make = RoadScenes(LaneGraph.from_centrelines(LINES, WIDTH))
+    history, size = vehicles((0.0, 0.0, 20.0), (30.0, WIDTH, 20.0), (100.0, 0.0, 20.0)), np.full((1, 3, 2), [4.5, 1.9])
+    for framed, there, centre in (
+        (None, [True, True, True], (130.0 / 3, WIDTH / 3)),
+        (2, [True, True, True], (15.0, WIDTH / 2)),
+        (2, [True, False, True], (0.0, 0.0)),
+        (None, [True, False, True], (50.0, 0.0)),
+    ):
+        scene = make(history, size, agent_mask=np.array([there]), framed=framed)
+        torch.testing.assert_close(scene.frame, torch.tensor([[*centre, 0.0]]).double(), atol=1e-5, rtol=0)
+        assert scene.agent_mask.tolist() == [there]
+        assert scene.future is scene.future_mask is scene.id is None
+
+
+@pytest.mark.parametrize("heading", [0.0, np.pi])
+def test_vehicles_that_drive_against_each_other_are_aligned_with_the_first_one(heading: float) -> None:
+    make = RoadScenes(LaneGraph.from_centrelines([LINES[0], LINES[1][::-1]], WIDTH))
+    states = [[20.0, 0.0, 0.0, 10.0], [20.0, WIDTH, np.pi, 10.0]]
+    history = np.array(states if heading == 0 else states[::-1])[None, :, None].repeat(10, 2)
+    assert make(history, np.full((1, 2, 2), [4.5, 1.9])).frame[0, 2].item() == pytest.approx(heading)
+
+
+def test_numbers_that_were_not_observed_are_not_read() -> None:
+    make = RoadScenes(LaneGraph.from_centrelines(LINES, WIDTH))
+    history, size = vehicles((0.0, 0.0, 20.0), (10.0, WIDTH, 25.0), (20.0, 0.0, 20.0)), np.full((1, 3, 2), [4.5, 1.9])
+    observed, there = np.ones((1, 3, 10), dtype=bool), np.array([[True, True, False]])
+    observed[0, 1, :4] = False
+    history[0, 1, :4], history[0, 2] = np.nan, np.nan
+    scene = make(history, size, observed, there)
+    assert scene.history_mask.tolist() == (observed & there[..., None]).tolist()
+    assert scene.history.isfinite().all()
+    history[0, 0, 2, 3] = np.nan
+    with pytest.raises(ValueError, match="agent 0 of scene 0 was observed at step 2 of history, but is not finite"):
+        make(history, size, observed, there)
+
+
+def test_a_closed_loop_goes_on_with_vehicles_on_no_lane_and_a_scene_has_all_lanes_where_none_are_left_out() -> None:
+    long = [np.stack([np.linspace(-100.0, 2900.0, 41), np.full(41, y)], 1) for y in (0.0, WIDTH)]
+    make = RoadScenes(LaneGraph.from_centrelines(long, WIDTH), WindowConfig(lanes=None))
+    history = vehicles((0.0, 0.0, 20.0), (10.0, 40.0, 25.0))
+    scene = make(history, np.full((1, 2, 2), [4.5, 1.9]), on_lanes_only=False)
+    assert scene.finite.all()
+    back = in_world(scene.history[:, :, -1], scene.frame)[0, :, :2]
+    torch.testing.assert_close(back, torch.tensor([[0.0, 0.0], [10.0, 40.0]]).double(), atol=1e-4, rtol=0)
+    assert scene.lanes.shape[1] == 2 * 50, "3000 m in pieces of 60 m"
+    assert scene.lane_mask.all()
