@@ -100,11 +100,18 @@ def silent(tasks) -> Report:
 
 
 def test_workers_do_every_task_once_and_give_results_as_they_are_finished(tmp_path):
-    tasks = [("first", tmp_path), ("late", tmp_path, "early"), ("early", tmp_path), ("last", tmp_path, "late")]
+    """Each task but the first two that finish waits until this process has used the result of the one before."""
+    tasks = [
+        ("first", tmp_path),
+        ("late", tmp_path, "used early"),
+        ("early", tmp_path),
+        ("last", tmp_path, "used late"),
+    ]
     progress, results = silent(tasks), {}
     for number, (task, result) in enumerate(finished(work, tasks, 2, progress, "kept", first_here=True)):
         assert progress.tasks == number, "a task counts when its result was used"
         results[task[0]] = result
+        (tmp_path / f"used {task[0]}").touch()
     assert progress.tasks == len(tasks) == len(results)
     assert list(results) == ["first", "early", "late", "last"]
     here, *others = (process for process, _ in results.values())

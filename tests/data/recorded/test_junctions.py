@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 
 import numpy as np
@@ -10,6 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from epo_lightning.data.recorded import summary
 from epo_lightning.data.recorded.junctions import (
     APART,
     CHANGE,
@@ -23,7 +25,6 @@ from epo_lightning.data.recorded.junctions import (
 from epo_lightning.data.recorded.lanes import SHOULDER, LaneGraph
 from epo_lightning.data.recorded.routes import BEHIND, BRAKING, PER_LINE, Routes, reach
 from epo_lightning.data.recorded.scenes import RecordedScenes
-from epo_lightning.data.recorded.summary import distance_to_goals
 from epo_lightning.data.recorded.windows import WindowConfig, extract, identifying
 from epo_lightning.registry import ConfigError
 
@@ -268,15 +269,23 @@ def test_scenes_have_the_lines_of_their_agents_and_masks_of_those_that_exist():
     assert scene.finite.all()
 
 
-def test_distances_to_goals_are_those_to_the_candidates_of_lines_that_exist():
+def test_distances_to_goals_are_those_to_the_candidates_of_lines_that_exist(monkeypatch):
     scenes, _ = extract(recording(curve(900.0, 0.3)), WINDOWS)
+    agents = len(scenes.history)
+    monkeypatch.setattr(summary, "AT_ONCE", agents - 1)  # the last one comes alone
     assert (scenes.lines < WINDOWS.lines).all()
     of_line = scenes.candidates.reshape(len(scenes.lines), scenes.references.shape[1], -1, 2)
     expected = [
         np.linalg.norm(of_line[agent, :count] - scenes.future[agent, -1, :2], axis=-1).min()
         for agent, count in enumerate(scenes.lines)
     ]
-    np.testing.assert_allclose(distance_to_goals(scenes), expected)
+    np.testing.assert_allclose(summary.distance_to_goals(scenes), expected)
+    mask = np.ones_like(scenes.future_mask)
+    mask[: agents // 2, -1] = False  # the ends of these are not observed
+    told = summary.describe(dataclasses.replace(scenes, future_mask=mask))
+    observed = expected[agents // 2 :]
+    wanted = [np.mean(observed), np.percentile(observed, 95)]
+    assert told["way to the nearest goal candidate [m], mean and 95th percentile"] == pytest.approx(wanted)
 
 
 def test_settings_of_junctions_enter_the_identity_of_a_data_set_only_where_they_are_used():
