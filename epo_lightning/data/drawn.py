@@ -14,6 +14,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from epo_lightning.checks import check_choice
 from epo_lightning.data import cache
 from epo_lightning.data.cache import SPLITS
 from epo_lightning.data.datamodule import SceneDataModule, SceneDataset
@@ -22,7 +23,7 @@ from epo_lightning.data.recorded.scenes import RecordedScenes
 from epo_lightning.data.recorded.windows import MOST_AGENTS, SPACING, VECTORS, WindowConfig
 from epo_lightning.data.rpi.scenes import RPIData, RPIDataset
 from epo_lightning.metrics.functional.interaction import SUBSETS
-from epo_lightning.registry import ConfigError, nearest, register
+from epo_lightning.registry import ConfigError, register
 from epo_lightning.scene import KINDS, heading_vector
 from epo_lightning.task import Task
 
@@ -235,8 +236,7 @@ class DrawnData(SceneDataModule):
         self, like: str = "highway", agents: int | None = None, scenes: int = 256, seed: int = 0, batch_size: int = 32
     ) -> None:
         super().__init__(batch_size, seed)
-        if like not in LIKE:
-            raise ConfigError(f"unknown data.like {like!r}: {nearest(str(like), LIKE)}")
+        check_choice("data.like", like, LIKE)
         self.like, self.preset = like, LIKE[like]
         if agents is not None and not 1 <= agents <= MOST_AGENTS:
             raise ConfigError(f"data.agents must be between 1 and {MOST_AGENTS}, or null for the task's, not {agents}")

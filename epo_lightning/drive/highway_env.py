@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from epo_lightning.checks import check_whole
+from epo_lightning.checks import check_choice, check_whole
 from epo_lightning.data.recorded.lanes import LANE, LaneGraph, Polylines
 from epo_lightning.drive.ride import WINDOWS, Moment, Position
 from epo_lightning.drive.traffic import TrafficWorld
-from epo_lightning.registry import ConfigError, nearest
+from epo_lightning.registry import ConfigError
 from epo_lightning.scene import HEADING, KINDS
 
 SEEDS = 1_000_000
@@ -109,8 +109,7 @@ class HighwayEnvSimulator:
                 f"episodes must be {APART} or fewer in world=highway_env, not {episodes}: further ones are those of the "
                 "next seed; drive several seeds"
             )
-        if place not in SETTINGS:
-            raise ConfigError(f"unknown place {place!r} of highway-env: {nearest(str(place), tuple(SETTINGS))}")
+        check_choice("place", place, SETTINGS, "highway-env")
         self._episodes, self._seed, self._setting = episodes, (SEEDS + seed) * APART, SETTINGS[place]
         self._environment = _environment(self._setting.environment)
         self._environment.reset(seed=self._seed)

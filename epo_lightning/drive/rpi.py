@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from epo_lightning.checks import check_whole
+from epo_lightning.checks import check_choice, check_whole
 from epo_lightning.data.rpi.game import AGENTS, Array, GameConstants, MainGame, generator, main_game
 from epo_lightning.data.rpi.kernels import costs, rollout, step
 from epo_lightning.data.rpi.modes import cheapest
@@ -27,7 +27,7 @@ from epo_lightning.data.rpi.subgames import HISTORY, by_agent, main_starts
 from epo_lightning.drive.world import EGO, Outcome, Search
 from epo_lightning.forecast import GameParameters
 from epo_lightning.game.feature_energy import FeatureEnergy
-from epo_lightning.registry import ConfigError, nearest
+from epo_lightning.registry import ConfigError
 from epo_lightning.scene import Scene
 
 PEDESTRIANS = ("plays", "ignores")
@@ -99,8 +99,7 @@ class RPIWorld:
 
     def __init__(self, episodes: int, seed: int = 0, pedestrian: str = "plays") -> None:
         check_whole("episodes", episodes)
-        if pedestrian not in PEDESTRIANS:
-            raise ConfigError(f"unknown pedestrian {pedestrian!r}: {nearest(str(pedestrian), PEDESTRIANS)}")
+        check_choice("pedestrian", pedestrian, PEDESTRIANS)
         self.constants, self.pedestrian = GameConstants(), pedestrian
         self._c, self.dt = self.constants.array(), self.constants.dt
         self._games = [main_game(SEEDS + seed, index, 0, 1, self.constants) for index in range(episodes)]

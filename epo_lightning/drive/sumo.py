@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from epo_lightning.checks import check_whole
+from epo_lightning.checks import check_choice, check_whole
 from epo_lightning.data.recorded.formats.lanelet2 import read_map
 from epo_lightning.data.recorded.lanes import LaneGraph
 from epo_lightning.data.simulate.demand import CLASSES, STYLES
@@ -30,7 +30,7 @@ from epo_lightning.data.simulate.traffic import simulator
 from epo_lightning.drive.ride import WINDOWS, Moment, Position
 from epo_lightning.drive.sumo_process import END, OWN, STEP, Branch, Vehicles, serve
 from epo_lightning.drive.traffic import TrafficWorld
-from epo_lightning.registry import ConfigError, nearest
+from epo_lightning.registry import ConfigError
 from epo_lightning.scene import KINDS
 
 SEEDS = 1_000_000
@@ -86,8 +86,7 @@ class SumoSimulator:
                 f"episodes must be {APART * PER_STREAM} or fewer in world=sumo, not {episodes}: further ones are those of "
                 "the next seed; drive several seeds"
             )
-        if style not in STYLES:
-            raise ConfigError(f"unknown traffic {style!r} of SUMO: {nearest(str(style), tuple(STYLES))}")
+        check_choice("traffic", style, STYLES, "SUMO")
         simulator()
         if not hasattr(os, "fork"):
             raise ConfigError("world=sumo branches episodes off by os.fork, which Linux and macOS have")

@@ -6,10 +6,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from epo_lightning.checks import check_choice
 from epo_lightning.data.recorded.windows import WindowConfig
 from epo_lightning.drive.rpi import PEDESTRIANS, RPIWorld
 from epo_lightning.drive.world import World
-from epo_lightning.registry import ConfigError, nearest
+from epo_lightning.registry import ConfigError
 from epo_lightning.schema import read
 
 CONSTANT_VELOCITY, BEST_RESPONSE, JOINT, DRIVER = "constant_velocity", "best_response", "joint", "driver"
@@ -38,8 +39,7 @@ class Place:
             ConfigError: the message names the kind, and the nearest known one.
         """
         for kind in kinds:
-            if kind not in self.kinds:
-                raise ConfigError(f"unknown others {kind!r} of world={world}: {nearest(kind, self.kinds)}")
+            check_choice("others", kind, self.kinds, f"world={world}")
             if kinds.count(kind) > 1:
                 raise ConfigError(f"others names {kind!r} twice: name each kind of others once")
 
@@ -111,6 +111,5 @@ def place(world: str) -> Place:
     Raises:
         ConfigError: the message names the nearest known one.
     """
-    if world not in WORLDS:
-        raise ConfigError(f"unknown world {world!r}: {nearest(world, tuple(WORLDS))}")
+    check_choice("world", world, WORLDS)
     return WORLDS[world]

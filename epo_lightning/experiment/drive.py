@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from epo_lightning.checks import check_choice
 from epo_lightning.data.cache import digest, file_digest
 from epo_lightning.data.rpi.game import RECIPE
 from epo_lightning.drive.driven import Driven
@@ -29,7 +30,7 @@ from epo_lightning.experiment.opening import open_checkpoint, settings_of
 from epo_lightning.experiment.provenance import commit
 from epo_lightning.files import write_file, write_json
 from epo_lightning.forecasters.base import Forecaster
-from epo_lightning.registry import ConfigError, nearest
+from epo_lightning.registry import ConfigError
 from epo_lightning.report.closed_loop import SHARE, measures_table, times_table
 from epo_lightning.run_folder import RunFolder
 
@@ -208,9 +209,7 @@ def _planners(settings: DriveSettings, where: Place, tell: Callable[[str], None]
     if len(lacking) == len(paths) * len(settings.ways) and not baselines:
         raise ConfigError(f"no planner is left to drive ({'; '.join(lacking)}): add to ways= or baselines=")
     for name in baselines:
-        if name not in where.baselines:
-            known = tuple(where.baselines)
-            raise ConfigError(f"unknown baseline {name!r} of world={settings.world}: {nearest(name, known)}")
+        check_choice("baseline", name, where.baselines, f"world={settings.world}")
         yield where.baselines[name], _baseline(name)
 
 
