@@ -35,7 +35,7 @@ FLOORS = {
     "refinement": {"doubts", "game", "solvers", "scene", "forecast", "registry", "checks"},
     "predictions": {"scene", "registry", "files", "refinement"},
     "encoders": {"scene"},
-    "metrics": {"scene", "forecast", "registry", "checks", "host"},
+    "metrics": {"scene", "forecast", "registry", "checks"},
     "decoders": {"scene", "registry", "checks", "game", "host", "warp_kernels"},
     "backbones": {"scene", "task", "registry", "encoders", "decoders"},
     "data": {"scene", "frames", "registry", "schema", "checks", "task", "metrics"},
