@@ -10,7 +10,7 @@ only. The layer knows the features of :class:`~epo_lightning.game.feature_energy
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -29,9 +29,6 @@ GRADIENT, RESIDUALS, FEATURES, STAGES = "gradient", "residuals", "features", "st
 RESIDUALS: it is half the sum of squares of residuals. FEATURES: its residuals are named features, whose Jacobians have a
 structure that the fast solver uses. STAGES: each of these features depends on one time step, a control and the state that it
 leads to."""
-
-_OF_GAMES = ("history", "agent_mask", "size", "kind", "references", "reference_mask", "reference_speed", "game_steps")
-"""The fields of a scene that terms may read."""
 
 _TABLE_ENTRIES = 2_000_000
 """Largest number of (pair of candidates, step) entries that are evaluated together, which bounds the memory."""
@@ -65,24 +62,6 @@ def check_names(
             raise ConfigError(f"unknown {key} {what} {name!r} in energy.{key}: {hint(name) or nearest(name, known)}")
     if len(set(names)) < len(names):
         raise ConfigError(f"energy.{key} names a {what} twice: {list(names)}")
-
-
-def _check_devices(scene: Scene, parameters: GameParameters, device: torch.device) -> None:
-    """Check that the tensors of a game are on the device of the controls: kernels read their addresses.
-
-    Raises:
-        ValueError: another device; the message names the tensor.
-    """
-    given = [(f"scene.{name}", getattr(scene, name)) for name in _OF_GAMES]
-    for name, value in vars(parameters).items():
-        named = value.items() if isinstance(value, Mapping) else [(None, value)]
-        given += [(f"parameters.{name}" + (f"[{key!r}]" if key else ""), tensor) for key, tensor in named]
-    for name, tensor in given:
-        if tensor is not None and tensor.device != device:
-            raise ValueError(
-                f"{name} is on the device {tensor.device}, and the controls are on {device}: move scene and parameters to "
-                "one device, for example by scene.to(device)"
-            )
 
 
 class Energy(ABC):
@@ -168,9 +147,8 @@ class Energy(ABC):
         """Check that scene, parameters and controls fit together.
 
         Raises:
-            ValueError: they do not; the message names the tensor and the expected shape or device.
+            ValueError: they do not; the message names the tensor and the expected shape.
         """
-        _check_devices(scene, parameters, controls.device)
         batch, agents = scene.agent_mask.shape
         if controls.dim() != 5 or controls.shape[0] != batch or controls.shape[2] != agents or controls.shape[4] != 2:
             expected = f"[{batch}, M, {agents}, K, 2]"

@@ -276,9 +276,9 @@ def test_tensors_on_another_device_than_the_controls_are_named():
     parameters, energy = random_game(scene, own=("goal",)), FeatureEnergy(["goal"])
     weights = {"goal": parameters.own_weights["goal"].to("meta")}
     for moved, game, named in (
-        (scene.to("meta"), parameters, r"scene\.history is on the device meta, and the controls are on cpu"),
-        (scene, replaced(parameters, goals=parameters.goals.to("meta")), r"parameters\.goals is on the device meta"),
-        (scene, replaced(parameters, own_weights=weights), r"parameters\.own_weights\['goal'\] is on the device meta"),
+        (scene.to("meta"), parameters, r"on the CPU, and scene\.history, .* on another device"),
+        (scene, replaced(parameters, goals=parameters.goals.to("meta")), r"and parameters\.goals on another device"),
+        (scene, replaced(parameters, own_weights=weights), r"and parameters\.own_weights\['goal'\] on another device"),
     ):
         with pytest.raises(ValueError, match=named):
             LevenbergMarquardt()(energy, moved, game)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import torch
 from torch import Tensor
@@ -30,7 +30,7 @@ class GameArrays:
             controls: any controls [B, M, N, K, 2].
 
         Raises:
-            ValueError: parameters that are not those of B scenes and M modes.
+            ValueError: parameters that are not those of B scenes and M modes, or tensors on another device.
         """
         self._controls = controls
         like = controls.dtype
@@ -50,6 +50,11 @@ class GameArrays:
         self._margin_slots = [PAIR.index(name) for name in energy.decoded_margins]
         self.kept: list[Tensor] = []
         self.game = self._describe(energy, scene, parameters)
+        if not all(tensor.is_cpu for tensor in (*self.inputs, *self.kept)):
+            raise ValueError(
+                f"the controls are on the CPU, and {', '.join(_elsewhere(scene, parameters))} on another device: move scene "
+                "and parameters to one device, for example by scene.to(device)"
+            )
 
     def _hold(self, tensor: Tensor) -> Tensor:
         # The kernel gets the address alone: the tensor has to live as long as this object.
@@ -132,6 +137,16 @@ def as_type(dtype: torch.dtype, tensor: Tensor) -> Tensor:
     """The tensor as numbers of a type."""
     # `to` takes a microsecond even if the type is right already, and there are twenty tensors.
     return tensor if tensor.dtype == dtype else tensor.to(dtype)
+
+
+def _elsewhere(scene: Scene, parameters: GameParameters) -> Iterator[str]:
+    """Names of the tensors of a game that are not on the CPU."""
+    for owner, fields in (("scene", vars(scene)), ("parameters", vars(parameters))):
+        for name, value in fields.items():
+            named = value.items() if isinstance(value, Mapping) else [(None, value)]
+            for key, tensor in named:
+                if isinstance(tensor, Tensor) and not tensor.is_cpu:
+                    yield f"{owner}.{name}" + (f"[{key!r}]" if key else "")
 
 
 def _has_gaps(energy: FeatureEnergy, scene: Scene) -> bool:
