@@ -68,7 +68,10 @@ def numbered(path: Path) -> Iterator[Path]:
 
 def neighbour(folder: Path) -> Path | None:
     """The folder beside a missing one whose name is most like it; None where there is none."""
-    beside = [entry.name for entry in folder.parent.iterdir() if entry.is_dir()] if folder.parent.is_dir() else []
+    try:
+        beside = [entry.name for entry in folder.parent.iterdir() if entry.is_dir()]
+    except OSError:  # no such folder, or one that may not be listed
+        return None
     close = difflib.get_close_matches(folder.name, beside, n=1)
     return folder.parent / close[0] if close else None
 

@@ -75,8 +75,10 @@ async function open(index) {
     const answer = await ask(`/scenes/${index}`);
     if (turn !== opened) return;
     scene = answer;
-  } catch (error) { complain(error); return; }
+  } catch (error) { if (turn === opened) complain(error); return; }
   solution = null;
+  dragging = null;
+  find("drawing").replaceChildren();
   edit = fresh(index);
   view = null;
   find("title").textContent = scene.title;
@@ -177,6 +179,7 @@ function outline(agent, state) {
 }
 
 function draw() {
+  if (!solution) return;  // of a scene that has just been opened
   view = view || extent();
   const drawing = find("drawing");
   drawing.setAttribute("viewBox", view.join(" "));

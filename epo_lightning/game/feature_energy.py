@@ -297,8 +297,9 @@ class FeatureEnergy(FeatureInputs):
         """
         present = scene.agent_mask
         finite = scene.current_or_zero.isfinite().flatten(1).all(1)
-        if self.needs_shape or self.needs_reach or "size" in self.needs:
-            size = self.size(scene) if self.needs_shape else self.size(scene)[..., :1]
+        paired = present.shape[1] > 1
+        if (paired and (self.needs_shape or self.needs_reach)) or "size" in self.needs:
+            size = self.size(scene) if paired and self.needs_shape else self.size(scene)[..., :1]
             finite = finite & ((size >= 0) & (size < torch.inf)).flatten(1).all(1)
         of_modes = finite[:, None].expand(-1, parameters.initial_controls.shape[1])
         for name in self.pair:

@@ -77,18 +77,20 @@ def with_motion(
     before, once it is ``TRAVELLED`` long: forecast positions are not smooth, and those of a standing agent have directions
     that mean nothing. Before, the agent keeps the heading of ``current``.
     """
-    place, heading = current[..., :2], current[..., HEADING]
-    headings = []
     with torch.no_grad():
-        for position in positions.unbind(-2):
-            east, north = (position - place).unbind(-1)
-            moved = east.square() + north.square() >= TRAVELLED**2
-            heading = torch.where(moved, torch.atan2(north, east), heading)
-            place = torch.where(moved[..., None], position, place)
-            headings.append(heading)
+        steps, place = positions.movedim((-2, -1), (0, 1)).contiguous(), current[..., :2].movedim(-1, 0)
+        direction, directions = torch.zeros_like(steps[0]), []
+        for position in steps:
+            way = position - place
+            moved = way.square().sum(0) >= TRAVELLED**2
+            direction, place = torch.where(moved, way, direction), torch.where(moved, position, place)
+            directions.append(direction)
+        east, north = torch.stack(directions, 1).movedim(1, -1)
+        never = (east == 0) & (north == 0)
+        heading = torch.where(never, current[..., None, HEADING], torch.atan2(north, east))
         before = torch.cat((current[..., None, :2], positions[..., :-1, :]), -2)
         speed = (positions - before).norm(dim=-1) / dt
-    return torch.cat((positions, torch.stack(headings, -1)[..., None], speed[..., None]), -1)
+    return torch.cat((positions, heading[..., None], speed[..., None]), -1)
 
 
 def demonstrated(scene: Scene) -> Bool[Tensor, "B N K"]:

@@ -273,11 +273,14 @@ def _may_be_missing(metric: str) -> bool:
 
 def _folders_apart(groups: Sequence[Sequence[EvaluatedRun]]) -> list[str]:
     """For each group of runs the folder that holds all of them; without those that hold a run of another group as well."""
-    folders = [os.path.commonpath([run.path for run in group]) for group in groups]
+    paths = [[run.path for run in group] for group in groups]
+    if len({path.is_absolute() for group in paths for path in group}) > 1:  # they have no folder in common
+        return []
+    folders = [os.path.commonpath(group) for group in paths]
     return [
         folder
-        for folder, group in zip(folders, groups, strict=True)
-        if not any(run.path.is_relative_to(folder) for other in groups if other is not group for run in other)
+        for folder, group in zip(folders, paths, strict=True)
+        if not any(path.is_relative_to(folder) for other in paths if other is not group for path in other)
     ]
 
 

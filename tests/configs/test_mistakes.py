@@ -46,6 +46,11 @@ MISTAKES = {
     "train ++energy.own={a:1}": "energy.own is a list, not the dictionary {a:1}: set it by energy.own=[...]",
     "train experiment=rpi/v_lstm optimizer=3": "optimizer=3 chooses an option that is no name: known: adam",
     "train experiment=rpi/v_lstm_epo solver.steps.max=2": "solver.steps is 2, a value without keys: set it by solver.steps=",
+    "train experiment=rpi/v_lstm logger=[csv,tensorboard] backbone=3": "backbone=3 chooses an option that is no name",
+    "predict run=x foo=3": "unknown key 'foo': known: animate, checkpoint",
+    "config check train experiment=rpi/v_lstm_epo_game_s2 forecaster.calibration.steps=3": (
+        "forecaster.calibration is null, so set all of it: forecaster.calibration={steps: <value>, ...}"
+    ),
     "train lr=3e-4": "unknown key 'lr': it is optimizer.lr",
     "train energy.own.goal=1": "energy.own.goal=1 names an entry of a list, whose entries have numbers: set the whole list",
     "train callbacks.monitor=val/nash_gap": "unknown callbacks.monitor 'val/nash_gap'",

@@ -301,8 +301,7 @@ class RecordedData(SceneDataModule):
                 self._make(workers, progress, strict, launch)
 
         if strict and self.config.get("skipped"):
-            with cache.locked(self.folder):
-                make()  # a recording that still cannot be read is an error
+            make()  # a recording that still cannot be read is an error
         elif not cache.make_once(self.folder, make):
             cache.verify(self.folder, self.command, self.config)
         return self.folder

@@ -125,10 +125,12 @@ def _other_kind(key: str, value: str) -> str:
 
 def _no_name(instance: Hydra, overrides: Sequence[str]) -> str:
     """The error message for a number or a dictionary as the option of a group; empty if no override has one."""
-    for word in overrides:
-        group, _, option = word.lstrip("+").partition("=")
-        if (options := options_of(instance, group)) and option not in options:
-            return f"{word} chooses an option that is no name: {_known(option, options)}"
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    for word, parsed in zip(overrides, OverridesParser.create().parse_overrides(list(overrides)), strict=True):
+        options = options_of(instance, parsed.key_or_group)
+        if options and not isinstance(option := parsed.value(), str | list) and not parsed.is_sweep_override():
+            return f"{word} chooses an option that is no name: {_known(str(option), options)}"
     return ""
 
 
@@ -233,8 +235,10 @@ def _unknown_key(instance: Hydra, name: str, key: str, overrides: Sequence[str])
     whole, walked = config, list[str]()
     for word in key.replace("/", ".").split("."):
         if walked and not isinstance(config, DictConfig):
-            whole_key = ".".join(walked)
-            return f"unknown key {key!r}: {whole_key} is {config}, a value without keys: set it by {whole_key}=<value>"
+            where = ".".join(walked)
+            if config is None:
+                return f"unknown key {key!r}: {where} is null, so set all of it: {where}={{{word}: <value>, ...}}"
+            return f"unknown key {key!r}: {where} is {config}, a value without keys: set it by {where}=<value>"
         names = [str(known) for known in config] if isinstance(config, DictConfig) else []
         if not walked and word != "hydra":
             names = [known for known in names if known != "hydra"]
@@ -255,7 +259,7 @@ def _unknown_key(instance: Hydra, name: str, key: str, overrides: Sequence[str])
             return f"{key} is a setting that the chosen file of {walked[0]} leaves at its default: set it by +{key}=<value>"
         if word not in names:
             level = f" in {'.'.join(walked)}" if walked else ""
-            inner = [name for name in names if isinstance(config[name], DictConfig) and word in config[name]]
+            inner = [name for name in names if isinstance(_get(config, name), DictConfig) and word in config[name]]
             if len(inner) == 1:
                 return f"unknown key {key!r}{level}: it is {'.'.join([*walked, inner[0], word])}"
             if not walked and word != "hydra":  # groups whose options have no section of their own, such as experiment
@@ -264,8 +268,15 @@ def _unknown_key(instance: Hydra, name: str, key: str, overrides: Sequence[str])
                 names = sorted({*names, *groups} - {"hydra"})
             return f"unknown key {key!r}{level}: {nearest(word, names)}"
         walked.append(word)
-        config = config[word]
+        config = _get(config, word)
     return f"unknown key {key!r}"
+
+
+def _get(config: Any, name: str) -> Any:
+    """A value of a configuration; None for one that the user has to set (``???``)."""
+    from omegaconf import OmegaConf
+
+    return None if OmegaConf.is_missing(config, name) else config[name]
 
 
 def _settings_in(place: Sequence[str], config: Any) -> Collection[str]:

@@ -213,13 +213,17 @@ def test_implicit_gradients_equal_central_differences_of_the_minimum(own):
     assert (sum(along).abs() < 1e-9 * size).all()
 
 
-def test_agents_of_a_negative_size_stop_their_game():
-    """A negative distance of touching would switch their interaction off, without a trace."""
+@pytest.mark.parametrize("backend", ["auto", "pytorch"])
+def test_agents_of_a_negative_size_stop_their_game(backend):
+    """A negative distance of touching would switch their interaction off, without a trace; one agent alone has none."""
     scene = random_scene(2, 2, history=2, size=2.0)
     scene.size[1, 0, 0] = -2.0
-    status = LevenbergMarquardt(2)(FeatureEnergy(["acc"]), scene, random_game(scene, own=("acc",))).status
+    solve = LevenbergMarquardt(2, backend=backend)
+    status = solve(FeatureEnergy(["acc"]), scene, random_game(scene, own=("acc",))).status
     assert (status[0] == Status.COMPLETED).all()
     assert (status[1] == Status.STOPPED).all()
+    alone = random_scene(1, 1, history=2, size=-2.0)
+    assert (solve(FeatureEnergy(["acc"]), alone, random_game(alone, own=("acc",))).status == Status.COMPLETED).all()
 
 
 def test_gauss_newton_hessians_give_another_implicit_gradient():
