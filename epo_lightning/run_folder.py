@@ -104,6 +104,10 @@ class RunFolder:
             ConfigError: there is no run; the message names the runs below ``path``.
         """
         run = cls(pretrained.folder_of(path) or Path(path).expanduser())
+        if run.path.is_file():
+            raise ConfigError(
+                f"{run.path} is a file, and not a run folder: name the folder with config.yaml and run.json"
+            )
         if not run.path.is_dir():
             beside = neighbour(run.path)
             raise ConfigError(
@@ -114,7 +118,11 @@ class RunFolder:
             )
         if not run.config_file.is_file() or not run.record_file.is_file():
             below = [str(found.path) for found in discover(run.path)]
-            hint = f"; runs below it: {', '.join(below[:8])} (use runs={run.path} for all)" if below else ""
+            hint = (
+                f"; runs below it: {', '.join(below[:8])} (epo evaluate and epo report take all of them by runs={run.path})"
+                if below
+                else ""
+            )
             if cls(run.path.parent).config_file.is_file():
                 hint = f"; its run is {run.path.parent}"
             raise ConfigError(f"{run.path} is not a run folder: it has no config.yaml and run.json{hint}")

@@ -23,6 +23,7 @@ from epo_lightning.experiment.config.replaced import keys_of
 from epo_lightning.experiment.config.settings import EvaluateSettings, Settings, TrainerSettings
 from epo_lightning.experiment.opening import open_checkpoint, open_data, settings_of, split_of
 from epo_lightning.experiment.other_data import OtherData, open_other
+from epo_lightning.experiment.provenance import of_other_code
 from epo_lightning.experiment.truth import TruthTest
 from epo_lightning.files import read_json, write_json
 from epo_lightning.metrics import ForecastMetrics
@@ -67,6 +68,12 @@ def evaluate(config: dict[str, Any], overrides: Sequence[str] = ()) -> list[tupl
                 raise
             refused.append(error)
             print(f"{run.path}: left out, {error}")
+    others = [run for run, *_ in scored if of_other_code(run.record) and not pretrained.ships(run.path)]
+    if others:
+        print(
+            f"{len(others)} of the {len(scored)} scored runs were trained by other code than the present one, the first one "
+            f"{others[0].path}: if their forecaster has changed, train them again in another folder"
+        )
     if refused and scored:
         print(f"{len(refused)} of {len(refused) + len(scored)} runs left out")
     if refused and not scored:

@@ -142,16 +142,21 @@ class ForecastMetrics(Metric):
 
         Raises:
             ValueError: the scene has no future or no sizes, or another number of agents or steps than the forecast; states
-                without headings; or probabilities that do not sum to one (not checked on a GPU, which would have to wait).
+                without headings; or probabilities of another shape, below zero, or that do not sum to one (their values are
+                not checked on a GPU, which would have to wait).
         """
         if forecast.states.shape[-1] != 4:
             raise ValueError(
                 f"forecast.states has shape {list(forecast.states.shape)}; it takes [B, M, N, K, 4]: x, y, heading, speed"
             )
-        total = forecast.probabilities.sum(1)
-        if total.device.type == "cpu" and ((total - 1).abs() > LARGEST_EXCESS).any():
+        probabilities, shape = forecast.probabilities, list(forecast.states.shape[:2])
+        if list(probabilities.shape) != shape:
+            raise ValueError(f"forecast.probabilities has shape {list(probabilities.shape)}; these states take {shape}")
+        total = probabilities.sum(1)
+        if total.device.type == "cpu" and (((total - 1).abs() > LARGEST_EXCESS).any() or (probabilities < 0).any()):
             raise ValueError(
-                f"forecast.probabilities [B, M] must sum to one for every scene, not to {total.tolist()[:4]}"
+                "forecast.probabilities [B, M] must be 0 or more and sum to one for every scene; the first ones sum to "
+                f"{total.tolist()[:4]}"
             )
         average = Errors.average(forecast.states, *observed_future(scene, "displacements need"))
         found = {**forecast_values(forecast, scene, average, self.shape), **own_values(forecast, scene)}

@@ -317,6 +317,9 @@ def test_runs_of_other_code_are_pointed_out(
     assert note in capsys.readouterr().out.replace("\n", " ")
     noted = next(line for line in Path("report/results.md").read_text().splitlines() if line.startswith(note))
     assert "V-LSTM (seed 0, 1); V-LSTM (seed 2), V-LSTM + SC (seed 0, 1, 2)." in noted
+    assert epo("evaluate", "runs=runs") == 0
+    told = capsys.readouterr().out
+    assert "2 of the 6 scored runs were trained by other code than the present one, the first one runs/" in told
     (run,) = (RunFolder(path) for path in Path("runs").rglob("v_lstm/*-s0*"))
     train = ("train", "experiment=rpi/v_lstm", *TINY, "seed=0", f"run_dir={run.path}")
     assert "holds a finished run of other code than the present one: nothing is overwritten" in refused(*train)

@@ -49,6 +49,8 @@ def test_a_missing_folder_is_answered_by_the_one_beside_it_with_a_similar_name(
     missing = tmp_path / "v_lstm_epo-s0-9f8e7d"
     for words in (f"evaluate run={missing}", f"evaluate runs={missing}", f"report runs={missing}"):
         assert f"did you mean {there}?" in refused(*words.split())
+    (tmp_path / "best.ckpt").touch()
+    assert "best.ckpt is a file, and not a run folder" in refused("evaluate", f"run={tmp_path / 'best.ckpt'}")
     for nothing in (tmp_path / "zzz", tmp_path / "no" / "such" / "folder"):
         assert "did you mean" not in refused("evaluate", f"run={nothing}").partition("The folder")[0]
 

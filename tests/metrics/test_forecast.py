@@ -191,8 +191,13 @@ def test_positions_without_headings_and_probabilities_of_another_sum_are_refused
     forecast, metrics = case.forecast(), ForecastMetrics(shape="box")
     with pytest.raises(ValueError, match=r"forecast\.states has shape \[.*, 2\]; it takes \[B, M, N, K, 4\]"):
         metrics.update(dataclasses.replace(forecast, states=forecast.states[..., :2]), case.scene())
-    with pytest.raises(ValueError, match=r"forecast\.probabilities .* must sum to one for every scene, not to \["):
-        metrics.update(dataclasses.replace(forecast, probabilities=2 * case.probabilities), case.scene())
+    below = torch.zeros_like(case.probabilities)
+    below[:, :2] = torch.tensor([1.5, -0.5])
+    for wrong in (2 * case.probabilities, below):
+        with pytest.raises(ValueError, match=r"forecast\.probabilities .* must be 0 or more and sum to one"):
+            metrics.update(dataclasses.replace(forecast, probabilities=wrong), case.scene())
+    with pytest.raises(ValueError, match=r"forecast\.probabilities has shape \[3, 1\]; these states take \[3, 2\]"):
+        metrics.update(dataclasses.replace(forecast, probabilities=case.probabilities[:, :1]), case.scene())
 
 
 def test_long_float32_sums_keep_their_digits() -> None:
