@@ -21,7 +21,7 @@ SAMPLES, WARM_UP = 100, 10
 """Number of measured scenes, as in the paper; and number of forecasts before them, which are not measured (warm-up)."""
 
 
-def measure(run: RunFolder, settings: Settings, devices: int | list[int]) -> dict[str, Any]:
+def measure(run: RunFolder, settings: Settings, devices: int | list[int] = 1) -> dict[str, Any]:
     """Time joint forecasts of single scenes of the test split by the best checkpoint, and write the run's ``runtime.json``.
 
     Nothing but the forecast is timed: the scene is on its device already, and no metric is computed.

@@ -373,9 +373,10 @@ def test_one_of_several_extracted_data_sets_is_chosen_by_its_folder(folder):
 def test_a_recording_is_reported_when_it_is_extracted(folder, capfd):
     data(folder).generate(workers=1, progress=True)
     lines = capfd.readouterr().err.splitlines()
-    assert len(lines) == 9
-    assert re.fullmatch(r"recording 3 of 9 extracted, \d+ s, about \d+ s left", lines[2])
-    assert re.fullmatch(r"recording 9 of 9 extracted, \d+ s", lines[8])
+    assert len(lines) == 10
+    assert lines[0] == "extracting recordings, 9 to do"
+    assert re.fullmatch(r"recording 3 of 9 extracted, \d+ s, about \d+ s left", lines[3])
+    assert re.fullmatch(r"recording 9 of 9 extracted, \d+ s", lines[9])
     data(folder).generate(workers=1, progress=True)
     assert not capfd.readouterr().err
 

@@ -225,7 +225,8 @@ def test_progress_counts_what_was_extracted_before(folder, monkeypatch, capsys, 
     made.extract(tasks[1:], 1, True, None)
     lines = capsys.readouterr().err.splitlines()
     assert [line.partition(",")[0] for line in lines] == [
-        f"{word} {number} of {count} extracted" for number in range(2, count + 1)
+        f"extracting {word}s",
+        *(f"{word} {number} of {count} extracted" for number in range(2, count + 1)),
     ]
     assert made.missing() == [0]
 
