@@ -169,10 +169,9 @@ class Energy(ABC):
         first, second = pairs(controls.shape[2], controls.device)
         own = self.own_terms(scene, parameters, states, controls)
         pair = self.pair_terms(scene, parameters, states[:, :, first], states[:, :, second])
+        # A term that is not named would be minimised, and be no part of any objective.
         for key, names, found in (("own", self.own, own), ("pair", self.pair, pair)):
-            if found.keys() != set(
-                names
-            ):  # a term that is not named would be minimised, and be no part of any objective
+            if found.keys() != set(names):
                 raise ValueError(
                     f"{type(self).__name__}.{key}_terms returns {sorted(found)}, and {key} names {sorted(names)}: both must "
                     "have the same terms"
