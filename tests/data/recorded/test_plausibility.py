@@ -50,8 +50,8 @@ def test_tracks_without_a_mistake_are_not_doubted() -> None:
         stand = dataclasses.replace(walking(), position=still + noise, velocity=velocity)
         assert not doubts(stand), "agents that stand, with noise in positions and velocities"
     kept = np.flatnonzero(walking().agent < 0)
-    nobody = {name: getattr(walking(), name)[kept] for name in ("agent", "frame", "position", "heading", "velocity")}
-    assert not doubts(dataclasses.replace(walking(), **nobody)), "no agents"
+    nothing = {name: getattr(walking(), name)[kept] for name in ("agent", "frame", "position", "heading", "velocity")}
+    assert not doubts(dataclasses.replace(walking(), **nothing)), "no agents"
 
 
 def test_agents_that_accelerate_between_frames_are_not_doubted() -> None:
