@@ -71,16 +71,16 @@ TRAVELLED = 0.5
 def with_motion(
     positions: Float[Tensor, "*batch K 2"], current: Float[Tensor, "*batch 4"], dt: float
 ) -> Float[Tensor, "*batch K 4"]:
-    """States from positions, with heading and speed of the motion.
+    """States from positions [m], with heading [rad] and speed [m/s] of the motion; steps are dt [s] apart.
 
     A speed is that of the motion between two steps. A heading is the direction of the motion from the place of the heading
     before, once it is ``TRAVELLED`` long: forecast positions are not smooth, and those of a standing agent have directions
     that mean nothing. Before, the agent keeps the heading of ``current``.
     """
     with torch.no_grad():
-        steps, place = positions.movedim((-2, -1), (0, 1)).contiguous(), current[..., :2].movedim(-1, 0)
-        direction, directions = torch.zeros_like(steps[0]), []
-        for position in steps:
+        by_step, place = positions.movedim((-2, -1), (0, 1)).contiguous(), current[..., :2].movedim(-1, 0)
+        direction, directions = torch.zeros_like(by_step[0]), []
+        for position in by_step:
             way = position - place
             moved = way.square().sum(0) >= TRAVELLED**2
             direction, place = torch.where(moved, way, direction), torch.where(moved, position, place)

@@ -255,28 +255,13 @@ Split = Literal["test", "val", "train", "all"]
 """Names of splits; ``all`` is that of all recordings, for data on which a run was not trained."""
 
 
-def check_split(split: str | None, data: Mapping[str, Any] | None) -> None:
-    """Refuse a split that a run's own data is not scored on.
+@dataclass(frozen=True, kw_only=True)
+class ScenesSettings:
+    """The scenes on which a trained run is used, and its checkpoint: the common part of the verbs for trained runs."""
 
-    Raises:
-        ConfigError: ``train`` or ``all`` without other data.
-    """
-    if data is None and split not in (None, "test", "val"):
-        raise ConfigError(
-            f"split={split} needs data=<data set>: on its own data, a run is scored on split=test or split=val"
-        )
-
-
-@dataclass(frozen=True)
-class EvaluateSettings:
-    """Configuration of ``epo evaluate``."""
-
-    run: str | None = None
-    runs: str | None = None
     data: Mapping[str, Any] | None = None
     split: Split | None = None
     checkpoint: str = "best"
-    batch_size: int = 256
     workers: int | None = None
 
     @property
@@ -285,33 +270,38 @@ class EvaluateSettings:
         return self.split or "test"
 
     def __post_init__(self) -> None:
+        if self.data is None and self.split not in (None, "test", "val"):
+            raise ConfigError(
+                f"split={self.split} needs data=<data set>: on its own data, a run is scored on split=test or split=val"
+            )
+        check_workers(self.workers)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateSettings(ScenesSettings):
+    """Configuration of ``epo evaluate``."""
+
+    run: str | None = None
+    runs: str | None = None
+    batch_size: int = 256
+
+    def __post_init__(self) -> None:
         if (self.run is None) == (self.runs is None):
             raise ConfigError("choose what to evaluate: run=<run folder>, or runs=<folder> for all runs below it")
-        check_split(self.split, self.data)
-        check_workers(self.workers)
+        super().__post_init__()
         if self.batch_size < 2:
             raise ConfigError(f"batch_size must be 2 or more, not {self.batch_size}")
 
 
 @dataclass(frozen=True, kw_only=True)
-class ForecastSettings:
+class ForecastSettings(ScenesSettings):
     """A run and the scenes that it forecasts: the common part of ``epo predict``, ``epo explore`` and ``epo export``."""
 
     run: str
-    data: Mapping[str, Any] | None = None
-    split: Split | None = None
-    checkpoint: str = "best"
     scenes: int | None = 64
-    workers: int | None = None
-
-    @property
-    def own_split(self) -> str:
-        """The split of the run's own data."""
-        return self.split or "test"
 
     def __post_init__(self) -> None:
-        check_split(self.split, self.data)
-        check_workers(self.workers)
+        super().__post_init__()
         if self.scenes is not None and self.scenes < 1:
             raise ConfigError(f"scenes must be 1 or more, or null for all, not {self.scenes}")
 

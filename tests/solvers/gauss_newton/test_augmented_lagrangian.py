@@ -54,11 +54,13 @@ def least_distance(states: torch.Tensor) -> float:
 
 
 def test_a_start_with_a_small_gradient_does_not_ask_for_more_than_double_precision_gives():
-    """Three cars that drive straight on at first: at the solution, the constraints balance a gradient of E 19 times as steep
-    as at the start, whose rounding is above a bound relative to the start alone."""
-    current = torch.tensor([[-10.0, 0.0, 0.0, 5.0], [10.0, 0.4, math.pi, 5.0], [0.3, -12.0, math.pi / 2, 5.0]])
+    """Three cars that drive straight on to their goals at first: at the solution, the constraints balance a steep gradient
+    of E, whose rounding is above a bound relative to the start alone."""
+    current = torch.tensor(
+        [[-10.0, 0.0, 0.0, 5.0], [10.0, 0.4, math.pi, 5.0], [0.3, -12.0, math.pi / 2, 5.0]], dtype=torch.double
+    )
     size = torch.tensor([4.5, 1.9], dtype=torch.double).expand(1, 3, 2)
-    scene = Scene(current.double()[None, :, None], dt=0.2, size=size)
+    scene = Scene(current[None, :, None], dt=0.2, size=size)
     turning = torch.tensor([0.0, 0.001], dtype=torch.double)
     parameters = GameParameters(
         own_weights={
