@@ -75,6 +75,7 @@ def largest_scenes(words: Sequence[str], count: int) -> tuple[Scene, str]:
         ConfigError: data that cannot be read, or without futures or sizes.
     """
     data = assembly.build_data({**compose("generate", list(words))["data"], "batch_size": 256})
+    data.words = list(words)  # for the command that an error names
     data.setup("test")
     best: list[tuple[int, int, Scene]] = []
     for number, scenes in enumerate(data.test_dataloader()):
