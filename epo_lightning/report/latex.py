@@ -16,6 +16,7 @@ from epo_lightning.report.render import (
     difference_text,
     legend,
     paper_text,
+    seeds_text,
     with_ends,
 )
 from epo_lightning.report.rows import Row
@@ -131,7 +132,8 @@ def _cell(row: Row, column: Column) -> str:
     deviation = ""
     if cell.deviation is not None:
         deviation = rf"\,{{\scriptsize$\pm$\,{_minus(column.deviation(cell.deviation, cell.mean))}}}"
-    return form % _minus(column.text(cell.mean)) + deviation
+    seeds = seeds_text(row, cell)
+    return form % _minus(column.text(cell.mean)) + deviation + (rf" \scriptsize({seeds})" if seeds else "")
 
 
 def _minus(text: str) -> str:

@@ -13,7 +13,7 @@ from typing import Any
 
 from epo_lightning.report.charts import Chart
 from epo_lightning.report.made import Made
-from epo_lightning.report.render import Sheet, difference_text, own_text, paper_text, signed, with_ends
+from epo_lightning.report.render import Sheet, difference_text, own_text, paper_text, seeds_text, signed, with_ends
 from epo_lightning.report.rows import Row
 from epo_lightning.report.style import svg
 from epo_lightning.report.tables import Table, distinct
@@ -114,6 +114,7 @@ def _table(table: Table, cells: list[dict[str, Any]], place: Any) -> dict[str, A
                 {
                     "mean": mean,
                     "deviation": deviation,
+                    "seeds": seeds_text(row, cell),
                     "value": repr(cell.mean),
                     "rank": {1: "best", 2: "second"}.get(cell.rank or 0, ""),
                     "paper": paper,

@@ -109,6 +109,11 @@ def own_text(cell: Cell, column: Column) -> str:
     return mean if cell.deviation is None else f"{mean} ± {column.deviation(cell.deviation, cell.mean)}"
 
 
+def seeds_text(row: Row, cell: Cell) -> str:
+    """The number of seeds of a cell, where some runs of its row lack the score; else empty."""
+    return "" if cell.n == len(row.runs) else f"n={cell.n}"
+
+
 def paper_text(row: Row, column: Column) -> str:
     """The paper's value with the digits of the paper; empty if there is none."""
     cell = row.cells.get(column.metric)
@@ -133,8 +138,12 @@ def legend(
         where: position of the paper's values, such as ``below``.
         bold, second: names of the markup of the best and second best values, themselves marked up.
     """
-    cells = [
-        row.cells[c.metric] for table in tables for row in table.rows for c in table.columns if c.metric in row.cells
+    shown = [
+        (row, row.cells[column.metric])
+        for table in tables
+        for row in table.rows
+        for column in table.columns
+        if column.metric in row.cells
     ]
     metrics = {column.metric for table in tables for column in table.columns}
     overlaps = any("overlap" in metric for metric in metrics)
@@ -145,10 +154,14 @@ def legend(
         and not ("overlap" in metric or is_own(metric))
         for metric in metrics
     )
-    mean = "Mean ± sample standard deviation over n seeds" if any(cell.deviation is not None for cell in cells) else ""
+    fewer = any(seeds_text(row, cell) for row, cell in shown)
+    mean = (
+        "Mean ± sample standard deviation over n seeds" if any(cell.deviation is not None for _, cell in shown) else ""
+    )
+    mean += ", or over those seeds that have the score, with their number in the cell" if fewer else ""
     paper = (
         f"{where}, the paper's value and ours minus the paper's"
-        if any(cell.paper is not None for cell in cells)
+        if any(cell.paper is not None for _, cell in shown)
         else ""
     )
     numbers = "; ".join(part for part in (mean, paper) if part)
@@ -162,7 +175,7 @@ def legend(
     parts = (
         f"Displacements in m, minimum over the modes{few}{rates}; lower is better." if errors else "",
         f"{numbers[0].upper()}{numbers[1:]}." if numbers else "",
-        ranked if any(cell.rank for cell in cells) else "",
+        ranked if any(cell.rank for _, cell in shown) else "",
         rules if overlaps else "",
         EFFECT if any(Column(metric, "").is_effect for metric in metrics) else "",
         GAMES if metrics & {*GAME} else "",
@@ -264,7 +277,8 @@ def _rich_cell(row: Row, column: Column) -> Text:
         return Text(MISSING)
     style = {1: "bold", 2: "underline"}.get(cell.rank or 0, "")
     deviation = "" if cell.deviation is None else f"\n±{column.deviation(cell.deviation, cell.mean)}"
-    return Text.assemble((column.text(cell.mean), style), (deviation, "dim"))
+    seeds = seeds_text(row, cell)
+    return Text.assemble((column.text(cell.mean), style), (deviation, "dim"), (f"\n{seeds}" if seeds else "", "dim"))
 
 
 def to_markdown(table: Table | Sheet) -> str:
@@ -313,8 +327,9 @@ def _markdown_cell(row: Row, column: Column) -> str:
     if cell is None:
         return MISSING
     form = {1: "**{}**", 2: "<u>{}</u>"}.get(cell.rank or 0, "{}")
-    paper = paper_text(row, column)
-    return form.format(own_text(cell, column)) + (f" ({paper}, {difference_text(row, column)})" if paper else "")
+    paper, seeds = paper_text(row, column), seeds_text(row, cell)
+    behind = [*([f"{paper}, {difference_text(row, column)}"] if paper else []), *([seeds] if seeds else [])]
+    return " ".join([form.format(own_text(cell, column)), *(f"({text})" for text in behind)])
 
 
 def to_csv(tables: Iterable[Table]) -> str:

@@ -14,11 +14,13 @@ from rich.console import Console
 from rich.table import Table as RichTable
 
 from epo_lightning.report.columns import Column
+from epo_lightning.report.latex import to_latex
 from epo_lightning.report.render import (
     Sheet,
     comparison_sheet,
     comparisons_to_csv,
     least_width,
+    legend,
     own_text,
     p_text,
     settings_sheet,
@@ -31,7 +33,7 @@ from epo_lightning.report.rows import Cell
 from epo_lightning.report.runs import collect
 from epo_lightning.report.selection import best_settings
 from epo_lightning.report.statistics import build_comparisons
-from epo_lightning.report.tables import build_tables
+from epo_lightning.report.tables import Table, build_tables
 
 from .run_folders import make_run, scores
 
@@ -43,7 +45,7 @@ def pairs(folder: Path) -> None:
         make_run(folder / f"e{seed}", "V-LSTM + EPO", "epo", scores(1.0 + seed), seed=seed, experiment="rpi/v_lstm_epo")
 
 
-def printed(table: Sheet, width: int = 80) -> str:
+def printed(table: Table | Sheet, width: int = 80) -> str:
     console = Console(file=io.StringIO(), width=width)
     console.print(to_rich(table))
     return console.file.getvalue()  # type: ignore[attr-defined]
@@ -116,6 +118,18 @@ def test_csv_has_the_provenance_of_every_number(tmp_path: Path) -> None:
     assert len({record["row"] for record in records}) == 2
     single = next(r for r in records if r["metric"] == "overlap_authors")
     assert (single["paper"], single["difference"]) == ("", "")
+
+
+def test_a_score_of_fewer_seeds_than_the_row_says_their_number(tmp_path: Path) -> None:
+    for seed, own in enumerate(({"own/near": 0.2}, {"own/near": 0.4}, {})):
+        make_run(tmp_path / str(seed), "V-LSTM + EPO", "epo", scores(0.1) | own, seed=seed)
+    main, further = build_tables(collect(tmp_path))
+    assert to_markdown(further).splitlines()[-1] == "| V-LSTM + EPO | 3 | 0.300 ± 0.141 (n=2) |"
+    assert "(n=2)" in to_latex(further)
+    assert "n=2" in printed(further)
+    assert "with their number in the cell" in legend([further])
+    assert "n=" not in to_markdown(main)
+    assert "with their number" not in legend([main])
 
 
 def test_markdown_titles_are_escaped(tmp_path: Path) -> None:
