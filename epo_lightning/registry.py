@@ -34,6 +34,16 @@ class ConfigError(ValueError):
     """A configuration that cannot work: the message names the key or value, what was expected and what to do."""
 
 
+def one_line(error: object, most: int | None = None) -> str:
+    """The message of an error in one line, cut after ``most`` characters."""
+    return " ".join(str(error).split())[:most]
+
+
+def kind_and_message(error: BaseException, most: int | None = None) -> str:
+    """Kind and message of an error in one line, ``ValueError: the message``, cut after ``most`` characters."""
+    return one_line(f"{type(error).__name__}: {error}", most)
+
+
 def nearest(word: str, known: Iterable[str]) -> str:
     """A hint for a misspelt ``word``: the nearest of the ``known`` names, then all of them."""
     known = sorted(known)
@@ -133,8 +143,9 @@ def _importing(module: str) -> Iterator[None]:
     except SyntaxError as error:
         raise ConfigError(f"{error.filename}:{error.lineno} is not Python: {error.msg}") from error
     except Exception as error:
-        what = f"{type(error).__name__}: {error}"
-        raise ConfigError(f"the module {module} fails when it is imported: {what}; --traceback shows where") from error
+        raise ConfigError(
+            f"the module {module} fails when it is imported: {kind_and_message(error)}; --traceback shows where"
+        ) from error
 
 
 @cache

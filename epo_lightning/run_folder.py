@@ -46,7 +46,7 @@ from typing import Any, Literal
 from epo_lightning import pretrained
 from epo_lightning.files import read_json, write_file, write_json
 from epo_lightning.masking import mask
-from epo_lightning.registry import ConfigError, nearest
+from epo_lightning.registry import ConfigError, nearest, one_line
 
 TRAINING, FINISHED, FAILED = "training", "finished", "failed"
 State = Literal["waiting", "running", "interrupted", "failed", "finished"]
@@ -263,7 +263,7 @@ class RunFolder:
             raise ConfigError(f"cannot read {self.config_file}: {error.strerror}") from error
         except (yaml.YAMLError, UnicodeDecodeError) as error:
             raise ConfigError(
-                f"{self.config_file} is not YAML ({' '.join(str(error).split())}); was it edited, or copied incompletely?"
+                f"{self.config_file} is not YAML ({one_line(error)}); was it edited, or copied incompletely?"
             ) from error
         if not isinstance(content, dict):
             raise ConfigError(f"{self.config_file} holds no configuration")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from epo_lightning.backbones.base import Backbone
-from epo_lightning.registry import ConfigError, failing_place, place
+from epo_lightning.registry import ConfigError, failing_place, kind_and_message, place
 from epo_lightning.scene import Scene
 from epo_lightning.task import Task
 
@@ -46,7 +46,7 @@ def try_backbone(backbone: Backbone, task: Task) -> None:
         except Exception as error:
             raise ConfigError(
                 f"the backbone {name} fails at {failing_place(error, type(backbone))} on trial scenes of {AGENTS} agents: "
-                f"{type(error).__name__}: {' '.join(str(error).split())}; --traceback shows more"
+                f"{kind_and_message(error)}; --traceback shows more"
             ) from error
         finally:
             for module in training:

@@ -33,7 +33,7 @@ from epo_lightning.experiment.dashboards import mlflow
 from epo_lightning.forecasters import SUPPLIED, Forecaster, build_forecaster
 from epo_lightning.game.features import OWN_FEATURES
 from epo_lightning.metrics.forecast import EQUILIBRIUM_METRICS, PAIR_METRICS, scores
-from epo_lightning.registry import ConfigError, nearest
+from epo_lightning.registry import ConfigError, nearest, one_line
 from epo_lightning.run_folder import RunFolder
 from epo_lightning.schema import check_part
 from epo_lightning.task import Task
@@ -168,9 +168,7 @@ def build_model(settings: Settings, data: Any) -> Forecaster:
     except ConfigError:
         raise
     except (TypeError, ValueError, RuntimeError, ArithmeticError) as error:
-        raise ConfigError(
-            f"the forecaster cannot be built{_suspects(configuration)}: {' '.join(str(error).split())}"
-        ) from error
+        raise ConfigError(f"the forecaster cannot be built{_suspects(configuration)}: {one_line(error)}") from error
     # Lightning converts the model as well, but only after it has loaded a checkpoint into the model.
     return forecaster.double() if settings.trainer.precision == "64-true" else forecaster
 
@@ -300,7 +298,7 @@ def naming(settings: TrainerSettings, run: RunFolder) -> Iterator[None]:
     except (MisconfigurationException, ValueError, RuntimeError) as error:
         raise ConfigError(
             f"this machine has no device for trainer.accelerator={settings.accelerator}, trainer.precision="
-            f"{settings.precision} ({' '.join(str(error).split())}): trainer.accelerator=cpu works everywhere "
+            f"{settings.precision} ({one_line(error)}): trainer.accelerator=cpu works everywhere "
             f"(for a run that has begun, change it in {run.config_file})"
         ) from error
 

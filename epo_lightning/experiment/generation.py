@@ -30,7 +30,7 @@ from epo_lightning.data.recorded.parts import Launch, PartTask
 from epo_lightning.data.workers import Report, finished
 from epo_lightning.experiment.config import compose
 from epo_lightning.experiment.sweeps.orphans import end_with
-from epo_lightning.registry import ConfigError
+from epo_lightning.registry import ConfigError, kind_and_message
 from epo_lightning.report.labels import value_text
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ def _launch_once(tasks: Sequence[PartTask], overrides: Sequence[str], jobs: int,
     except ConfigError:
         raise
     except Exception as error:
-        return f"the launcher broke down ({type(error).__name__}: {' '.join(str(error).split())[:200]})"
+        return f"the launcher broke down ({kind_and_message(error, 200)})"
     for result in done:
         if isinstance(result._return_value, Exception):
             raise result._return_value

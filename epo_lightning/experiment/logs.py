@@ -27,6 +27,7 @@ from epo_lightning.experiment.pictures import choose, draw, forecast_of
 from epo_lightning.files import read_json
 from epo_lightning.identity import SECTIONS, identity
 from epo_lightning.masking import mask
+from epo_lightning.registry import kind_and_message
 from epo_lightning.run_folder import RunFolder, read_log
 from epo_lightning.schema import read
 
@@ -137,5 +138,5 @@ def _pictures(settings: Settings, run: RunFolder, count: int) -> list[Path]:
         forecast = forecast_of(forecaster, scenes)
         return [path for path, _ in draw(request, settings.title, forecaster.task.shape, scenes, forecast)]
     except Exception as error:  # a run must not fail because a picture cannot be drawn
-        print(f"{run.path}: no pictures ({type(error).__name__}: {error})", file=sys.stderr)
+        print(f"{run.path}: no pictures ({mask(kind_and_message(error, 300))})", file=sys.stderr)
         return []

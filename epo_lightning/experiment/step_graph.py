@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.forecasters import Forecaster
 from epo_lightning.losses import Schedule
-from epo_lightning.registry import ConfigError
+from epo_lightning.registry import ConfigError, one_line
 from epo_lightning.scene import FIELDS, Scene
 
 WARM_UP = 3
@@ -175,7 +175,7 @@ class StepGraph(Callback):
         except RuntimeError as error:
             cause = error.__context__ or error  # the end of a broken capture has an error of its own
             raise ConfigError(
-                f"this training step cannot be captured as a CUDA graph ({' '.join(str(cause).split())[:300]}): "
+                f"this training step cannot be captured as a CUDA graph ({one_line(cause, 300)}): "
                 "set trainer.graph=false"
             ) from error
         if not torch.equal(before, torch.get_rng_state()):

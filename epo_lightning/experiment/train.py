@@ -22,7 +22,7 @@ from epo_lightning.experiment.opening import refuse_changed, settings_of
 from epo_lightning.experiment.provenance import commit, of_other_code, versions
 from epo_lightning.forecasters.checkpoint import read_checkpoint
 from epo_lightning.identity import check_unchanged, differences, identity, row_identity
-from epo_lightning.registry import ConfigError
+from epo_lightning.registry import ConfigError, kind_and_message
 from epo_lightning.report.columns import is_own
 from epo_lightning.run_folder import FAILED, FINISHED, TRAINING, RunFolder
 from epo_lightning.schema import read
@@ -175,7 +175,7 @@ def _errors_recorded(run: RunFolder) -> Iterator[None]:
         yield
     except Exception as error:
         with contextlib.suppress(OSError, ConfigError):  # the disk may be what failed
-            run.update(status=FAILED, error=f"{type(error).__name__}: {' '.join(str(error).split())}"[:500])
+            run.update(status=FAILED, error=kind_and_message(error, 500))
         raise
     finally:
         with contextlib.suppress(OSError):

@@ -12,7 +12,7 @@ import torch
 from epo_lightning import pretrained
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.forecasters.checkpoint import read_checkpoint
-from epo_lightning.registry import ConfigError, build, check_keys, lookup, nearest, place
+from epo_lightning.registry import ConfigError, build, check_keys, lookup, nearest, one_line, place
 from epo_lightning.task import TASK_KEYS, Task
 
 __all__ = ["Forecaster", "Task", "build_forecaster", "check_model", "load"]
@@ -159,6 +159,6 @@ def load(checkpoint: str | Path) -> Forecaster:
     except RuntimeError as error:
         raise ConfigError(
             f"{checkpoint} does not fit the architecture that its own configuration describes; it was written by another "
-            f"version or for another model: {' '.join(str(error).split())[:300]}"
+            f"version or for another model: {one_line(error, 300)}"
         ) from error
     return forecaster.eval()

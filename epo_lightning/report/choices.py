@@ -11,7 +11,7 @@ from typing import Any
 
 import yaml
 
-from epo_lightning.registry import ConfigError
+from epo_lightning.registry import ConfigError, one_line
 from epo_lightning.report.selection import SEARCHED, BestSetting
 
 HEADER = """\
@@ -93,9 +93,7 @@ def read_choices(file: str) -> Choices:
             f"choices={file} has the entry {twice} twice, and only one of them can count: leave one of them out"
         ) from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(
-            f"choices={file} is not YAML ({' '.join(str(error).split())}); it must have {what}"
-        ) from error
+        raise ConfigError(f"choices={file} is not YAML ({one_line(error)}); it must have {what}") from error
     if not isinstance(content, dict) or not content:
         raise ConfigError(f"choices={file} has no choices: it must have {what}")
     found = {}

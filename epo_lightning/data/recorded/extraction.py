@@ -25,7 +25,7 @@ from epo_lightning.data.recorded.plausibility import doubts, doubts_of_lanes
 from epo_lightning.data.recorded.surroundings import far_from_lanes
 from epo_lightning.data.recorded.tracks import Recording, RecordingSource
 from epo_lightning.data.recorded.windows import WindowConfig, extract
-from epo_lightning.registry import ConfigError, failing_place
+from epo_lightning.registry import ConfigError, failing_place, kind_and_message
 
 OUTCOMES = "recordings"
 """Key of the outcomes in the metadata of a file."""
@@ -137,7 +137,7 @@ def _read(source: RecordingSource) -> Recording:
     except (ConfigError, OSError, MemoryError):
         raise
     except Exception as error:
-        what = f"{type(error).__name__}: {' '.join(str(error).split())}"[:400]
+        what = kind_and_message(error, 400)
         raise RecordingError(place, f"its reader fails at {failing_place(error, source.read)}, {what}") from error
 
 

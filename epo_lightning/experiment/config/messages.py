@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from epo_lightning.experiment.config.sources import EXPERIMENTS, file_of, options_of
-from epo_lightning.registry import ConfigError, nearest, parts
+from epo_lightning.registry import ConfigError, nearest, one_line, parts
 
 if TYPE_CHECKING:
     from hydra._internal.hydra import Hydra
@@ -190,7 +190,7 @@ def _missing_option(instance: Hydra, missing: str, message: str) -> str:
     if options and not option:
         return f"{group}= chooses nothing: {_known('', options)}"
     if not options:
-        return f"unknown configuration {missing!r}: " + " ".join(message.split())
+        return f"unknown configuration {missing!r}: " + one_line(message)
     if option in parts(group):
         return (
             f"unknown option {group}={option}: there is a part of this name, but no file conf/{group}/{option}.yaml, which "

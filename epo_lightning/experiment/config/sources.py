@@ -14,7 +14,7 @@ from omegaconf import Container, DictConfig, ListConfig, OmegaConf
 from yaml import YAMLError
 
 from epo_lightning.identity import leaves
-from epo_lightning.registry import ConfigError
+from epo_lightning.registry import ConfigError, one_line
 
 if TYPE_CHECKING:
     from hydra._internal.hydra import Hydra
@@ -62,7 +62,7 @@ def _where(file: Path, error: Exception) -> str:
     """The problem in a file of YAML, with its line."""
     mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
     line = "" if mark is None else f":{mark.line + 1}"
-    return f"{file}{line} is not YAML: {' '.join(str(problem or error).split())}"
+    return f"{file}{line} is not YAML: {one_line(problem or error)}"
 
 
 def _check_colons(file: Path, config: Container) -> None:

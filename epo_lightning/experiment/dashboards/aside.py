@@ -19,6 +19,7 @@ from lightning.pytorch.loggers import Logger
 
 from epo_lightning.experiment.dashboards.base import Dashboard, Ending, Row
 from epo_lightning.masking import mask
+from epo_lightning.registry import kind_and_message
 
 BEHIND = 20_000
 """Largest number of rows in a dashboard's queue: less than a hundred megabytes."""
@@ -83,7 +84,7 @@ class Aside(Logger):
                     self.dashboard.close(ending)
                     return
         except BaseException as error:  # no error of a dashboard may reach the training, not even SystemExit
-            self._switch_off(mask(" ".join(f"{type(error).__name__}: {error}".split()))[:300])
+            self._switch_off(mask(kind_and_message(error))[:300])
 
     def _waiting(self) -> tuple[list[Row], Ending | None]:
         """The next rows in the queue: the first one and those that arrive soon after it; and the ending, if it is there."""

@@ -15,6 +15,7 @@ from urllib.request import Request, urlopen
 
 from epo_lightning.experiment.config.settings import WandbSettings
 from epo_lightning.experiment.dashboards.base import ARTIFACTS, Dashboard, Ending, Facts, Row
+from epo_lightning.registry import one_line
 
 STEP = "trainer/global_step"
 """The x axis of all curves. W&B's own step counts rows, which has no meaning after `wandb sync` has joined several files."""
@@ -60,7 +61,7 @@ class WandB(Dashboard):
             try:
                 self._begin("online")
             except Exception as error:
-                self._offline(" ".join(str(error).split())[:200])
+                self._offline(one_line(error, 200))
 
     def _offline(self, why: str) -> None:
         self._begin("offline")

@@ -23,7 +23,7 @@ from epo_lightning.experiment.sweeps.watch import news, note_former, status, sum
 from epo_lightning.experiment.sweeps.work import job_of
 from epo_lightning.experiment.verbs import check_settings, make_data
 from epo_lightning.files import read_json
-from epo_lightning.registry import ConfigError, nearest
+from epo_lightning.registry import ConfigError, kind_and_message, nearest
 from epo_lightning.report.choices import Choices, read_choices
 from epo_lightning.report.entries import TEXT, WHOLE, check_entries
 from epo_lightning.report.folds import fold
@@ -315,7 +315,7 @@ def _launch(
         except ConfigError:
             raise
         except Exception as error:
-            print(f"the launcher broke down ({_said(error)})", flush=True)
+            print(f"the launcher broke down ({kind_and_message(error, 200)})", flush=True)
             while running := sum(sweep.state(job) == "running" for job in left):
                 print(f"waiting for {running} runs that go on", flush=True)
                 while sum(sweep.state(job) == "running" for job in left) == running:
@@ -325,11 +325,6 @@ def _launch(
     for job in left:
         if sweep.state(job) in ("interrupted", "trained, not scored"):
             sweep.fail(job.run, KILLED)
-
-
-def _said(error: Exception) -> str:
-    """Kind and beginning of the message of an error, in one line."""
-    return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
 
 
 def _search(sweep: Sweep, words: Sequence[str], task: Callable[..., Any], extra: Sequence[str]) -> bool:
@@ -349,6 +344,6 @@ def _search(sweep: Sweep, words: Sequence[str], task: Callable[..., Any], extra:
     except Exception as error:  # no run gave a result, for example
         if isinstance(error, ConfigError) and len(sweep.jobs) == len(found):
             raise
-        print(f"the search ended early ({_said(error)})", flush=True)
+        print(f"the search ended early ({kind_and_message(error, 200)})", flush=True)
         return False
     return True

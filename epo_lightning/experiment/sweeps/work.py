@@ -15,6 +15,7 @@ from epo_lightning.experiment.sweeps.orphans import end_with
 from epo_lightning.experiment.sweeps.sweep import Job, Sweep
 from epo_lightning.identity import identity
 from epo_lightning.masking import mask
+from epo_lightning.registry import kind_and_message
 from epo_lightning.report.runs import data_name
 from epo_lightning.schema import read
 
@@ -73,7 +74,7 @@ def work(sweep: Sweep, config: Mapping[str, Any], overrides: Sequence[str], opti
             sweep.add(job_of(config, overrides))
         training.train(dict(config), [*overrides, *options])
     except Exception as error:
-        message = mask(f"{type(error).__name__}: {' '.join(str(error).split())}")
+        message = mask(kind_and_message(error))
         message = message.replace(f"{sweep.root}{os.sep}", f"{os.path.relpath(sweep.root)}{os.sep}")
         sweep.fail(run, message, mask(traceback.format_exc()))
         raise RunFailed(f"{settings.title}, seed {settings.seed}: {message}") from None

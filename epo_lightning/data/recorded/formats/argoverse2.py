@@ -25,7 +25,7 @@ from epo_lightning.data.recorded.formats.onboard import References, refuse, trac
 from epo_lightning.data.recorded.kinds import kinds_of, typical_sizes
 from epo_lightning.data.recorded.lanes import FARTHEST, LANE, SHOULDER, LaneGraph, Polyline
 from epo_lightning.data.recorded.tracks import Recording, RecordingError, RecordingSource, TrackTable
-from epo_lightning.registry import register
+from epo_lightning.registry import one_line, register
 
 SPLITS = ("train", "val", "test")
 """Names of the folders of the publisher's splits."""
@@ -165,7 +165,7 @@ def _table(path: Path) -> pl.DataFrame:
             path, f"the columns {', '.join(COLUMNS)} were expected, but {str(error).partition(';')[0]}"
         ) from None
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, ValueError) as error:
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        reason = one_line(error, 200) or type(error).__name__
         raise RecordingError(path, f"it cannot be read as parquet ({reason}): fetch the file again") from None
     for name in COLUMNS:
         kind = rows.schema[name]
