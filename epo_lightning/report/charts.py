@@ -24,7 +24,7 @@ from epo_lightning.report.efficiency import Efficiency, draw_efficiency, efficie
 from epo_lightning.report.paper import RUNTIME, RUNTIME_MODES
 from epo_lightning.report.runtime import OURS, THEIRS, draw_modes, heat_map
 from epo_lightning.report.tables import Table, distinct, trained_rows
-from epo_lightning.report.timings import Timing, grid, methods, over_modes, places, time
+from epo_lightning.report.timings import Timing, grid, methods, over_modes, places, time_text
 
 Size = tuple[float, float]
 
@@ -224,9 +224,9 @@ def _timing_numbers(timing: Timing) -> tuple[str, ...]:
         str(timing.agents),
         "-" if timing.steps is None else str(timing.steps),
         str(timing.modes),
-        time(timing.mean),
-        time(timing.median),
-        f"{time(timing.p10)} to {time(timing.p90)}",
+        time_text(timing.mean),
+        time_text(timing.median),
+        f"{time_text(timing.p10)} to {time_text(timing.p90)}",
         str(timing.samples),
         str(timing.run.path),
     )

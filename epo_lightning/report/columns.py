@@ -107,13 +107,13 @@ STOPPED = "stopped"
 TRUE = "true_"
 """Beginning of the names of metrics that compare inferred costs with the true ones."""
 
-OWN = "own"
+OWN = "own/"
 """Beginning of the names of metrics that users have registered: ``own/jerk``, of a subset ``executed/own/jerk``."""
 
 
 def is_own(metric: str) -> bool:
     """Whether a user has registered the metric."""
-    return OWN in metric.split("/")[:-1]
+    return f"/{OWN}" in f"/{metric}"
 
 
 TRUTH = (

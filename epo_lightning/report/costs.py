@@ -12,7 +12,7 @@ from epo_lightning.report.curves import METRIC, validation_log
 from epo_lightning.report.render import Sheet, signed
 from epo_lightning.report.rows import Row
 from epo_lightning.report.tables import Table, distinct, trained_rows
-from epo_lightning.report.timings import Timing, duration, time
+from epo_lightning.report.timings import Timing, duration_text, time_text
 
 TRAINED = ("training", "steps", "ms per step")
 SETTLED = "last fifth"
@@ -68,12 +68,12 @@ def _line(row: Row, timings: Sequence[Timing], labels: dict[str, str]) -> tuple[
     training = [MISSING] * len(TRAINED)
     if trained:
         seconds, steps = (statistics.fmean(values) for values in zip(*trained, strict=True))
-        training = [duration(seconds), f"{steps:.0f}", f"{1000 * seconds / steps:.3g}"]
+        training = [duration_text(seconds), f"{steps:.0f}", f"{1000 * seconds / steps:.3g}"]
     paths = {run.path for run in row.runs}
     forecasts = []
     for machine in labels:
         medians = [t.median for t in timings if t.run.path in paths and t.machine == machine]
-        forecasts.append(time(statistics.fmean(medians)) if medians else MISSING)
+        forecasts.append(time_text(statistics.fmean(medians)) if medians else MISSING)
     parameters = ", ".join(dict.fromkeys(str(run.parameters) for run in row.runs if run.parameters is not None))
     return row.name, str(len(row.runs)), *training, _settled(row), parameters or MISSING, *forecasts
 

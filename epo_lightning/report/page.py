@@ -13,10 +13,20 @@ from typing import Any
 
 from epo_lightning.report.charts import Chart
 from epo_lightning.report.made import Made
-from epo_lightning.report.render import Sheet, difference_text, own_text, paper_text, seeds_text, signed, with_ends
+from epo_lightning.report.render import (
+    COMPARISON_LEGEND,
+    Sheet,
+    difference_text,
+    own_text,
+    paper_text,
+    seeds_text,
+    signed,
+    with_ends,
+)
 from epo_lightning.report.rows import Row
 from epo_lightning.report.style import svg
 from epo_lightning.report.tables import Table, distinct
+from epo_lightning.report.worth import LEGEND as WORTH_LEGEND
 
 WIDEST, COLORS = 1500, 128
 """Largest width [pixels] and palette size of pictures: a page should be small enough to mail."""
@@ -29,7 +39,7 @@ class Content:
     Attributes:
         title: title of the page.
         command: command that writes the page again.
-        preface, legend, worth_legend, comparison_legend: Markdown; only bold, underline and code are rendered.
+        preface, legend: Markdown; only bold, underline and code are rendered.
         tables, transfer, costs, worth, comparisons, settings: shown on the page; all but ``tables`` are text in columns.
         charts: figures, grouped by their section.
         pictures: PNG files.
@@ -43,8 +53,6 @@ class Content:
     command: str
     preface: str
     legend: str
-    worth_legend: str
-    comparison_legend: str
     tables: Sequence[Table]
     transfer: Sequence[Sheet]
     costs: Sequence[Sheet]
@@ -85,6 +93,8 @@ def page(content: Content) -> str:
         charts.setdefault(chart.section, []).append(_drawn(chart))
     return environment.get_template("page.html.j2").render(
         content=content,
+        worth_legend=WORTH_LEGEND,
+        comparison_legend=COMPARISON_LEGEND,
         css=Markup((folder / "page.css").read_text(encoding="utf-8")),
         js=Markup((folder / "page.js").read_text(encoding="utf-8")),
         tables=tables,

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap, LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullLocator
 
-from epo_lightning.report.paper import RUNTIME
 from epo_lightning.report.style import MODES, style
-from epo_lightning.report.timings import time
+from epo_lightning.report.timings import time_text
 
 BLUES = LinearSegmentedColormap.from_list("calm", ["#EEF5FB", "#C6DBEF", "#6BAED6", "#2171B5", "#0B3F7A"])
 """Colour map from light (fast) to dark (slow), as in the paper."""
@@ -22,7 +23,7 @@ OURS, THEIRS = MODES[1], "#8A8A8A"
 
 def heat_map(
     seconds: Mapping[tuple[int, int | None], float],
-    paper: Mapping[tuple[int, int], float] = RUNTIME,
+    paper: Mapping[tuple[int, int], float],
     size: tuple[float, float] = (6.4, 4.4),
 ) -> Figure:
     """Heat map of the runtime over agents (x axis) and steps (y axis), with the paper's values below ours.
@@ -53,36 +54,10 @@ def heat_map(
         )
         for row, s in enumerate(steps):
             for column, n in enumerate(agents):
-                if (own := seconds.get((n, s))) is None:
-                    continue
-                theirs = None if s is None else paper.get((n, s))
-                color = "white" if norm(own) > 0.55 else "#16324F"
-                at, gid = (column + 0.5, row + 0.5), f"keep-{n}-{s}"
-                if theirs is None:
-                    axes.text(*at, time(own), ha="center", va="center", color=color, weight="bold", gid=gid)
-                    continue
-                axes.annotate(
-                    time(own),
-                    at,
-                    (0, 1),
-                    textcoords="offset points",
-                    ha="center",
-                    va="bottom",
-                    color=color,
-                    weight="bold",
-                    gid=gid,
-                )
-                axes.annotate(
-                    f"paper {time(theirs)}",
-                    at,
-                    (0, -2),
-                    textcoords="offset points",
-                    ha="center",
-                    va="top",
-                    color=color,
-                    fontsize=7.5,
-                    gid=f"{gid}-paper",
-                )
+                if (own := seconds.get((n, s))) is not None:
+                    theirs = None if s is None else paper.get((n, s))
+                    color = "white" if norm(own) > 0.55 else "#16324F"
+                    _write_cell(axes, (column + 0.5, row + 0.5), own, theirs, color, f"keep-{n}-{s}")
         axes.set_xticks(np.arange(len(agents)) + 0.5, [str(n) for n in agents])
         axes.set_yticks(np.arange(len(steps)) + 0.5, ["no game" if s is None else str(s) for s in steps])
         axes.invert_yaxis()
@@ -92,6 +67,17 @@ def heat_map(
         axes.grid(visible=False)
         axes.spines[:].set_visible(False)
         return figure
+
+
+def _write_cell(axes: Axes, at: tuple[float, float], own: float, theirs: float | None, color: str, gid: str) -> None:
+    """Write our seconds at a place of the heat map, and the paper's below them, if it has any."""
+    centred: dict[str, Any] = {"ha": "center", "color": color}
+    if theirs is None:
+        axes.text(*at, time_text(own), va="center", weight="bold", gid=gid, **centred)
+        return
+    below: dict[str, Any] = {"textcoords": "offset points", **centred}
+    axes.annotate(time_text(own), at, (0, 1), va="bottom", weight="bold", gid=gid, **below)
+    axes.annotate(f"paper {time_text(theirs)}", at, (0, -2), va="top", fontsize=7.5, gid=f"{gid}-paper", **below)
 
 
 def draw_modes(
@@ -145,7 +131,7 @@ def draw_modes(
         ticks = [m * 10.0**e for e in range(-7, 4) for m in (1, 3) if low <= m * 10.0**e <= high]
         axes.set_yticks(ticks)
         axes.yaxis.set_minor_locator(NullLocator())
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: time(value)))
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: time_text(value)))
         marks = sorted({*seconds, *paper})
         axes.set_xticks(marks, [str(mark) for mark in marks])
         axes.set_xlabel("modes M")

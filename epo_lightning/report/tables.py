@@ -102,8 +102,8 @@ def build_tables(runs: Iterable[EvaluatedRun]) -> list[Table]:
         lost = (Column(STOPPED, "all scenes"), *subset_columns(rows, (Column(STOPPED, ""),)))
         tables += _partly_shown(f"{where}: share of modes that violate hard constraints", lost, rows)
         tables += _partly_shown(f"{where}: inferred against true costs", TRUTH, rows)
-        own = sorted({metric for row in rows for metric in row.cells if metric.startswith(f"{OWN}/")})
-        measured = tuple(Column(metric, metric.removeprefix(f"{OWN}/")) for metric in own)
+        own = sorted({metric for row in rows for metric in row.cells if metric.startswith(OWN)})
+        measured = tuple(Column(metric, metric.removeprefix(OWN)) for metric in own)
         tables += _partly_shown(f"{where}: further metrics", (*measured, *subset_columns(rows, measured)), rows)
     return tables
 
@@ -131,7 +131,7 @@ def subset_columns(rows: Iterable[Row], columns: Sequence[Column]) -> tuple[Colu
     """The columns for every named subset of the data of which a row has scores, subset by subset."""
     names = {metric.split("/")[0] for row in rows for metric in row.cells if "/" in metric}
     # The executed mode comes first, although "alternative" precedes "executed" in the files.
-    subsets = sorted(names - {"initial", OWN}, key=lambda name: (name != "executed", name))
+    subsets = sorted(names - {"initial", OWN.removesuffix("/")}, key=lambda name: (name != "executed", name))
     return tuple(Column(f"{name}/{c.metric}", f"{name} {c.label}".strip()) for name in subsets for c in columns)
 
 

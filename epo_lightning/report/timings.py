@@ -144,9 +144,9 @@ def timing_sheet(where: str, timings: Sequence[Timing]) -> Sheet:
         if paper is None and (t.agents, t.steps) == (4, 2):
             paper = RUNTIME_MODES.get(t.modes)
         sizes = (str(t.agents), "-" if t.steps is None else str(t.steps), str(t.modes))
-        times = (time(t.mean), time(t.median), f"{time(t.p10)} to {time(t.p90)}")
+        times = (time_text(t.mean), time_text(t.median), f"{time_text(t.p10)} to {time_text(t.p90)}")
         names = (str(t.run.config().get("title", "untitled")),) if named else ()
-        lines.append((*names, *sizes, *times, str(t.samples), "" if paper is None else time(paper)))
+        lines.append((*names, *sizes, *times, str(t.samples), "" if paper is None else time_text(paper)))
     header = (*(("method",) if named else ()), "N", "S", "M", "mean", "median", "10 % to 90 %", "forecasts", "paper")
     return Sheet(f"Time of a forecast: {where}", header, tuple(lines), left=int(named))
 
@@ -159,7 +159,7 @@ def _means(keys: Mapping[Timing, Any]) -> dict[Any, float]:
     return {key: statistics.fmean(values) for key, values in groups.items()}
 
 
-def duration(seconds: float) -> str:
+def duration_text(seconds: float) -> str:
     """A duration as text: ``75 s``, ``12 min``, ``3 h 10 min``."""
     if seconds < 120:
         return f"{seconds:.0f} s"
@@ -167,7 +167,7 @@ def duration(seconds: float) -> str:
     return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60} min"
 
 
-def time(seconds: float) -> str:
+def time_text(seconds: float) -> str:
     """A time as text with two significant digits and its unit: ``1.2 ms``, ``35 µs``."""
     for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
         # Two digits may round up to a thousand: 0.9996 s are 1 s.

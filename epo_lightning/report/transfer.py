@@ -6,8 +6,6 @@ data set and a split, read with the same windows.
 
 from __future__ import annotations
 
-import math
-import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,7 +14,7 @@ from typing import Any
 from epo_lightning.report.columns import MISSING, Column
 from epo_lightning.report.records import Records
 from epo_lightning.report.render import Sheet, csv_text, own_text
-from epo_lightning.report.rows import Cell, plain_rows
+from epo_lightning.report.rows import Cell, cell_of, plain_rows
 from epo_lightning.report.runs import EvaluatedRun, is_part, read_other, read_run
 from epo_lightning.report.tables import FORECASTERS
 
@@ -124,12 +122,9 @@ def _line(checkpoint: str, scores: Mapping[TestSet, Mapping[int, EvaluatedRun]],
 
 
 def _cells(runs: Sequence[EvaluatedRun]) -> dict[str, Cell]:
-    cells = {}
-    for metric in runs[0].metrics:
-        values = [run.metrics[metric] for run in runs if metric in run.metrics]
-        many = len(values) > 1 and all(map(math.isfinite, values)) and (runs[0].learned or len({*values}) > 1)
-        cells[metric] = Cell(statistics.fmean(values), statistics.stdev(values) if many else None, n=len(values))
-    return cells
+    metrics = dict.fromkeys(metric for run in runs for metric in run.metrics)
+    scores = {metric: [run.metrics[metric] for run in runs if metric in run.metrics] for metric in metrics}
+    return {metric: cell_of(values, runs[0].learned) for metric, values in scores.items()}
 
 
 def _order(line: Line) -> tuple[bool, str, str, int, str]:

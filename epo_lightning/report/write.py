@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 
@@ -17,6 +18,7 @@ from epo_lightning.report.costs import cost_sheets, timings_of
 from epo_lightning.report.labels import word
 from epo_lightning.report.latex import comparisons_to_latex, sheet_to_latex, to_latex
 from epo_lightning.report.made import Made, how_made
+from epo_lightning.report.notes import of_different_batches, of_different_code, untaught
 from epo_lightning.report.paper import has_values
 from epo_lightning.report.records import TIME, Records
 from epo_lightning.report.render import (
@@ -33,16 +35,18 @@ from epo_lightning.report.render import (
     to_rich,
     without_html,
 )
-from epo_lightning.report.rows import of_different_batches, of_different_code, untaught
 from epo_lightning.report.runs import EvaluatedRun, collect, find_runs, read_parts, scored, scored_elsewhere
 from epo_lightning.report.selection import BestSetting, best_settings
-from epo_lightning.report.statistics import build_comparisons
+from epo_lightning.report.statistics import Comparisons, build_comparisons
 from epo_lightning.report.tables import Table, build_tables, distinct
 from epo_lightning.report.timings import places, read_timings, timing_sheet
-from epo_lightning.report.transfer import transfer_sheets, transfers, transfers_to_csv
+from epo_lightning.report.transfer import Line, transfer_sheets, transfers, transfers_to_csv
 from epo_lightning.report.worth import LEGEND as WORTH_LEGEND
 from epo_lightning.report.worth import build_worth
 from epo_lightning.run_folder import RunFolder
+
+if TYPE_CHECKING:
+    from epo_lightning.report.charts import Chart
 
 
 @dataclass(frozen=True)
@@ -126,96 +130,167 @@ def write_report(
     Raises:
         ConfigError: as :func:`~epo_lightning.report.tables.build_tables`.
     """
-    from epo_lightning.report.charts import charts_of
-    from epo_lightning.report.page import Content, page
     from epo_lightning.report.style import save
 
     out = Path(out).expanduser()
+    found = _gather(report, notes)
+    links = [f"figures/{chart.name}.png" for chart in found.charts] + [os.path.relpath(file, out) for file in figures]
+    texts = _texts(found, report, preface, [Path(figure) for figure in figures], links)
+    for chart in found.charts:
+        save(chart.draw(chart.wide, True), out / "figures" / f"{chart.name}.png")
+    for name, text in texts.items():
+        write_file(out / name, text)
+    _print(console or Console(), found, report.left_out)
+    return texts["results.md"]
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What a report shows, as it was found in the records of its runs.
+
+    Attributes:
+        tables: rows and their scores.
+        transfers: scores on other data.
+        of_game, comparisons: paired differences that show the worth of the game, and all others.
+        best: the best settings of searches.
+        costs, timed: times beside scores, and the other times.
+        made: provenance of every row.
+        charts: figures of many runs.
+        notes: notes on what the reader should know of the runs, or on what could not be shown.
+    """
+
+    tables: list[Table]
+    transfers: list[Line]
+    of_game: list[Comparisons]
+    comparisons: list[Comparisons]
+    best: list[BestSetting]
+    costs: list[Sheet]
+    timed: list[Sheet]
+    made: list[Made]
+    charts: list[Chart]
+    notes: list[str]
+
+    @property
+    def settings(self) -> list[Sheet]:
+        return [settings_sheet(self.best)] if self.best else []
+
+    @property
+    def worth(self) -> list[Sheet]:
+        return [comparison_sheet(entry) for entry in self.of_game]
+
+    @property
+    def compared(self) -> list[Sheet]:
+        return [comparison_sheet(entry) for entry in self.comparisons]
+
+    @property
+    def elsewhere(self) -> list[Sheet]:
+        return transfer_sheets(self.transfers)
+
+
+def _gather(report: Report, notes: Sequence[str]) -> _Found:
+    """Everything that the files of a report show; ``notes`` stand among those on the runs."""
+    from epo_lightning.report.charts import charts_of
+
     tables = build_tables([*report.evaluated, *(part for run in report.runs for part in read_parts(run))])
     timings, damaged = read_timings(report.runs)
-    of_game, comparisons = build_worth(tables), build_comparisons(tables)
-    worth, compared = ([comparison_sheet(entry) for entry in entries] for entries in (of_game, comparisons))
     best, hint = _best(report.evaluated)
-    settings = [settings_sheet(best)] if best else []
     rows = distinct(tables)
-    notes = [*of_different_code(rows), *of_different_batches(rows), *untaught(rows), *notes, *damaged]
-    notes += [hint] if hint else []
-    made, charts = how_made(tables, timings), charts_of(tables, timings)
-    costs = cost_sheets(tables, timings)
-    elsewhere = transfers(report.runs)
-    transfer = transfer_sheets(elsewhere)
     others = [timing for timing in timings if timing not in timings_of(tables, timings)]  # a cost is said once
-    timed = [timing_sheet(where, same) for where, same in places(others).items()]
-    shown: list[Sheet] = [*settings, *worth, *compared, *timed]
-    links = [f"figures/{chart.name}.png" for chart in charts] + [os.path.relpath(figure, out) for figure in figures]
-    markdown = "\n".join(
-        part
-        for part in (
-            f"# Results: {without_html(report.title)}\n",
-            f"{code(report.sweep)}\n" if report.sweep else "",
-            preface.strip() + "\n" if preface.strip() else "",
-            *(without_html(note) + "\n" for note in notes),
-            *(to_markdown(table) for table in tables),
-            legend(tables) + "\n" if tables else "",
-            *(to_markdown(sheet) for sheet in transfer),
-            *(to_markdown(sheet) for sheet in costs),
-            *(to_markdown(sheet) for sheet in shown),
-            WORTH_LEGEND + "\n" if worth else "",
-            COMPARISON_LEGEND + "\n" if worth or compared else "",
-            _how_made(made, report),
-            *(f"![{Path(link).stem}]({link})\n" for link in links),
-        )
-        if part
+    return _Found(
+        tables=tables,
+        transfers=transfers(report.runs),
+        of_game=build_worth(tables),
+        comparisons=build_comparisons(tables),
+        best=best,
+        costs=cost_sheets(tables, timings),
+        timed=[timing_sheet(where, same) for where, same in places(others).items()],
+        made=how_made(tables, timings),
+        charts=charts_of(tables, timings),
+        notes=[
+            *of_different_code(rows),
+            *of_different_batches(rows),
+            *untaught(rows),
+            *notes,
+            *damaged,
+            *([hint] if hint else []),
+        ],
     )
+
+
+def _texts(
+    found: _Found, report: Report, preface: str, figures: Sequence[Path], links: Sequence[str]
+) -> dict[str, str]:
+    """The report's text files by their names."""
+    texts = {
+        "results.md": _markdown(found, report, preface, links),
+        "index.html": _page(found, report, preface, figures),
+    }
+    if choices := choices_to_yaml(found.best, report.command):
+        texts["choices.yaml"] = choices
+    if found.transfers:
+        texts["transfer.csv"] = transfers_to_csv(found.transfers)
+    if found.tables:
+        texts["results.csv"] = to_csv(found.tables)
+        caveat = _caveat(found.tables) if preface.strip() else ""
+        latex = [to_latex(table, caveat=caveat) for table in found.tables]
+        latex += [sheet_to_latex(sheet, caveat=caveat) for sheet in (*found.elsewhere, *found.costs)]
+        latex += [comparisons_to_latex(entry, caveat=caveat) for entry in (*found.of_game, *found.comparisons)]
+        latex += [sheet_to_latex(sheet, caveat=caveat) for sheet in found.settings]
+        texts["results.tex"] = "\n".join(latex)
+    if found.of_game or found.comparisons:
+        texts["comparisons.csv"] = comparisons_to_csv([*found.of_game, *found.comparisons])
+    return texts
+
+
+def _markdown(found: _Found, report: Report, preface: str, links: Sequence[str]) -> str:
+    """The text of results.md."""
+    parts = (
+        f"# Results: {without_html(report.title)}\n",
+        f"{code(report.sweep)}\n" if report.sweep else "",
+        preface.strip() + "\n" if preface.strip() else "",
+        *(without_html(note) + "\n" for note in found.notes),
+        *map(to_markdown, found.tables),
+        legend(found.tables) + "\n" if found.tables else "",
+        *map(to_markdown, (*found.elsewhere, *found.costs)),
+        *map(to_markdown, (*found.settings, *found.worth, *found.compared, *found.timed)),
+        WORTH_LEGEND + "\n" if found.of_game else "",
+        COMPARISON_LEGEND + "\n" if found.of_game or found.comparisons else "",
+        _how_made(found.made, report),
+        *(f"![{Path(link).stem}]({link})\n" for link in links),
+    )
+    return "\n".join(part for part in parts if part)
+
+
+def _page(found: _Found, report: Report, preface: str, figures: Sequence[Path]) -> str:
+    """The HTML of the report."""
+    from epo_lightning.report.page import Content, page
+
     content = Content(
         title=report.title,
         command=report.command,
         preface=preface,
-        legend=legend(tables, "below"),
-        worth_legend=WORTH_LEGEND,
-        comparison_legend=COMPARISON_LEGEND,
-        tables=tables,
-        transfer=transfer,
-        costs=costs,
-        worth=worth,
-        comparisons=compared,
-        settings=settings,
-        charts=charts,
-        pictures=[Path(figure) for figure in figures],
-        made=made,
+        legend=legend(found.tables, "below"),
+        tables=found.tables,
+        transfer=found.elsewhere,
+        costs=found.costs,
+        worth=found.worth,
+        comparisons=found.compared,
+        settings=found.settings,
+        charts=found.charts,
+        pictures=figures,
+        made=found.made,
         left_out=report.left_out,
-        notes=notes,
+        notes=found.notes,
         sweep=report.sweep,
     )
-    files = {"results.md": markdown, "index.html": page(content)}
-    if choices := choices_to_yaml(best, report.command):
-        files["choices.yaml"] = choices
-    if elsewhere:
-        files["transfer.csv"] = transfers_to_csv(elsewhere)
-    if tables:
-        files["results.csv"] = to_csv(tables)
-        caveat = _caveat(tables) if preface.strip() else ""
-        latex = [to_latex(table, caveat=caveat) for table in tables]
-        latex += [sheet_to_latex(sheet, caveat=caveat) for sheet in (*transfer, *costs)]
-        latex += [comparisons_to_latex(entry, caveat=caveat) for entry in (*of_game, *comparisons)]
-        latex += [sheet_to_latex(sheet, caveat=caveat) for sheet in settings]
-        files["results.tex"] = "\n".join(latex)
-    if of_game or comparisons:
-        files["comparisons.csv"] = comparisons_to_csv([*of_game, *comparisons])
-
-    for chart in charts:
-        save(chart.draw(chart.wide, True), out / "figures" / f"{chart.name}.png")
-    for name, text in files.items():
-        write_file(out / name, text)
-    _print(console or Console(), notes, [*tables, *transfer, *costs, *shown], report.left_out)
-    return markdown
+    return page(content)
 
 
-def _print(
-    console: Console, notes: Sequence[str], tables: Sequence[Table | Sheet], left_out: Sequence[tuple[str, str]]
-) -> None:
+def _print(console: Console, found: _Found, left_out: Sequence[tuple[str, str]]) -> None:
     """Print the tables between the notes and a summary of the runs that were left out."""
-    for note in notes:
+    tables: list[Table | Sheet] = [*found.tables, *found.elsewhere, *found.costs]
+    tables += [*found.settings, *found.worth, *found.compared, *found.timed]
+    for note in found.notes:
         console.print(note, style="yellow", markup=False, highlight=False, soft_wrap=True)
     terminal = console.width
     for rich in map(to_rich, tables):

@@ -21,7 +21,7 @@ from epo_lightning.report.runs import collect, find_runs
 from epo_lightning.report.runtime import draw_modes, heat_map
 from epo_lightning.report.style import svg
 from epo_lightning.report.tables import build_tables, distinct
-from epo_lightning.report.timings import grid, over_modes, places, read_timings, time, timing_sheet
+from epo_lightning.report.timings import grid, over_modes, places, read_timings, time_text, timing_sheet
 from epo_lightning.run_folder import RunFolder
 
 from .page_runs import over_runtime, over_steps, rows_with_seeds, timed, write_log
@@ -157,7 +157,7 @@ def test_the_heat_map_shows_every_timing_and_the_papers(tmp_path: Path) -> None:
     modes, seconds = grid(members)
     assert modes == 4
     assert len(seconds) == 21
-    figure = heat_map(seconds)
+    figure = heat_map(seconds, RUNTIME)
     mesh = figure.axes[0].collections[0].get_array()
     assert mesh.shape == (6, 4)  # S = none, 1, 2, 4, 8, 12 downwards; N = 2, 4, 8, 12
     assert mesh[0, 1] == 0.0009
@@ -166,8 +166,8 @@ def test_the_heat_map_shows_every_timing_and_the_papers(tmp_path: Path) -> None:
         for column, agents in enumerate((2, 4, 8, 12)):
             assert mesh[row, column] == seconds[agents, steps]
     by_id = {text.get_gid(): text.get_text() for text in figure.findobj(Text) if text.get_gid()}
-    assert by_id["keep-12-8"] == time(seconds[12, 8])
-    assert by_id["keep-12-8-paper"] == f"paper {time(RUNTIME[12, 8])}" == "paper 320 ms"
+    assert by_id["keep-12-8"] == time_text(seconds[12, 8])
+    assert by_id["keep-12-8-paper"] == f"paper {time_text(RUNTIME[12, 8])}" == "paper 320 ms"
     assert "keep-4-None-paper" not in by_id
 
 
@@ -216,7 +216,7 @@ def test_a_damaged_timing_gives_a_note(tmp_path: Path, changes: dict[str, object
 
 def test_times_have_two_digits_and_a_unit() -> None:
     values = (12.3, 1.04, 0.9996, 0.17, 0.0099, 0.00123, 0.000046, 2e-7)
-    assert [time(value) for value in values] == [
+    assert [time_text(value) for value in values] == [
         *("12 s", "1.0 s", "1.0 s", "170 ms", "9.9 ms", "1.2 ms", "46 µs", "0.2 µs"),
     ]
 
@@ -260,7 +260,10 @@ def test_svg_drawings_have_unique_ids_and_no_style_sheet() -> None:
 
 def test_labels_do_not_overlap() -> None:
     seconds = {(n, s): 0.0123 * n * (s or 1) for n in (2, 4, 8, 12) for s in (None, 1, 2, 4, 8, 12)}
-    for figure in (heat_map(seconds, size=(4.0, 4.4)), heat_map({(2, 1): 0.1, (4, 1): 0.2}, size=(4.0, 4.4))):
+    for figure in (
+        heat_map(seconds, RUNTIME, size=(4.0, 4.4)),
+        heat_map({(2, 1): 0.1, (4, 1): 0.2}, RUNTIME, size=(4.0, 4.4)),
+    ):
         svg(figure, "laid-out")  # drawing lays out
         boxes = [text.get_window_extent() for text in figure.findobj(Text) if text.get_text() and text.get_visible()]
         edges = figure.bbox

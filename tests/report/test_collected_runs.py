@@ -16,7 +16,8 @@ from rich.console import Console
 from epo_lightning.files import write_json
 from epo_lightning.identity import identity, row_identity
 from epo_lightning.registry import ConfigError
-from epo_lightning.report.rows import Row, of_different_code, untaught
+from epo_lightning.report.notes import of_different_code, untaught
+from epo_lightning.report.rows import Row
 from epo_lightning.report.runs import collect, find_runs
 from epo_lightning.report.statistics import build_comparisons
 from epo_lightning.report.tables import build_tables, distinct, over_folds

@@ -19,7 +19,7 @@ from epo_lightning.report.paper import is_papers
 from epo_lightning.report.render import legend, to_markdown
 from epo_lightning.report.runs import collect, find_runs
 from epo_lightning.report.tables import Table, build_tables
-from epo_lightning.report.timings import duration, read_timings
+from epo_lightning.report.timings import duration_text, read_timings
 from epo_lightning.report.write import Report, write_report
 
 from .methods import METHODS, PARTS, of_methods, time_it
@@ -284,7 +284,7 @@ def test_runtime_figures_show_one_method_each(tmp_path: Path) -> None:
 
 
 def test_durations_have_a_suitable_unit() -> None:
-    assert [duration(value) for value in (0.4, 75, 119.4, 720, 11400)] == [
+    assert [duration_text(value) for value in (0.4, 75, 119.4, 720, 11400)] == [
         "0 s",
         "75 s",
         "119 s",

@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 
 from epo_lightning.files import write_json
 from epo_lightning.registry import ConfigError
+from epo_lightning.report.notes import of_different_batches
 from epo_lightning.report.paper import papers_name
 from epo_lightning.report.render import legend
-from epo_lightning.report.rows import Cell, of_different_batches
+from epo_lightning.report.rows import Cell
 from epo_lightning.report.runs import collect, data_name
 from epo_lightning.report.tables import build_tables
 from report.table_rows import rows_of

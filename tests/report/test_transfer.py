@@ -98,6 +98,14 @@ def test_scores_on_a_part_of_the_own_data_are_tables_of_their_own(tmp_path: Path
     assert transfer_sheets(transfers(report.runs))[0].header[3:] == ("b, test",)
 
 
+def test_a_metric_that_the_first_seed_lacks_is_in_the_csv(tmp_path: Path) -> None:
+    runs = [make_run(tmp_path / f"{seed}", "SC", "scene_consistent", scores(1.0), seed=seed) for seed in (0, 1)]
+    on(runs[0], "b", 2.0)
+    on(runs[1], "b", 4.0, metrics=scores(4.0) | {"own/near": 0.5})
+    rows = csv.DictReader(transfers_to_csv(transfers(runs)).splitlines())
+    assert [(row["mean"], row["n"]) for row in rows if row["metric"] == "own/near"] == [("0.5", "1")]
+
+
 def test_parts_are_told_apart_by_split_share_and_checkpoint(tmp_path: Path) -> None:
     run = make_run(tmp_path / "sc", "SC", "scene_consistent", None, data="a", digest="A")
     for place, (split, share, checkpoint) in enumerate(

@@ -19,7 +19,7 @@ from epo_lightning.experiment.sweeps.sweep import Job, State, Sweep
 from epo_lightning.files import read_json
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.labels import MOST, short_keys, shortened, shown, word
-from epo_lightning.report.timings import duration
+from epo_lightning.report.timings import duration_text
 
 STYLES: dict[State, str] = {
     "done": "green",
@@ -167,7 +167,7 @@ def how_far(job: Job) -> str:
     if not steps:
         return f"step {step}"
     done = step - progress.get("from_step", 0)
-    left = f", {duration((steps - step) * since / done)} left" if done and since else ""
+    left = f", {duration_text((steps - step) * since / done)} left" if done and since else ""
     return f"step {step} of {steps}{left}"
 
 
@@ -181,7 +181,7 @@ def result(job: Job) -> str:
         told = [f"{best[0]} {best[1]:.4f}"] if best else []
         if "test" in job.measures:
             told.append(f"test/minSADE {read_json(job.run.metrics_file('test'))['metrics']['minSADE']:.4f}")
-        told.append(duration(record.get("seconds", 0.0)))
+        told.append(duration_text(record.get("seconds", 0.0)))
     if "time" in job.measures:
         seconds = read_json(job.run.metrics_file("time"))["seconds"]["median"]
         told.append(f"{1000 * seconds:.1f} ms per forecast")
