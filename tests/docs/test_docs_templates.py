@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -19,6 +20,7 @@ def test_the_pages_of_results_have_templates() -> None:
         for page in (
             "results",
             "claims",
+            "results_files",
             "drive",
             "rpi",
             "rpi_results",
@@ -37,3 +39,10 @@ def test_the_pages_of_results_have_templates() -> None:
 def test_a_page_is_rebuilt_from_the_results_files_byte_for_byte(template: Path, tmp_path: Path) -> None:
     written = write_page(template, ROOT / "results", tmp_path).read_text(encoding="utf-8")
     assert written == template.with_suffix("").read_text(encoding="utf-8"), "make tables writes it again"
+
+
+def test_the_list_of_results_files_is_that_of_the_page_of_evidence() -> None:
+    claims, files = ((ROOT / "docs" / f"{page}.md.j2").read_text(encoding="utf-8") for page in ("claims", "results_files"))
+    used = set(re.findall(r'(?:results|folds|transfer)\("(\w+)"', claims))
+    assert used
+    assert used == {name for name in re.findall(r'"(\w+)"', files) if (ROOT / "results" / f"{name}.json").exists()}
