@@ -76,7 +76,7 @@ def _warnings_in_lines() -> Iterator[None]:
 def _farewell(ended: str, words: Sequence[str], ending: BaseException) -> str:
     """The line that a command prints when a signal ended it: how it ended, and how to continue.
 
-    A training notes how, once it has a run folder.
+    Once it has a run folder, a training adds the command that continues it.
     """
     notes = getattr(ending, "__notes__", [])
     if "explore" in words:  # it is ended by Ctrl-C, and has nothing to continue

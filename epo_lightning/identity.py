@@ -47,7 +47,10 @@ LATER = {
     "forecaster.calibration.starts": [0.0],
     "forecaster.calibration.training": False,
 }
-"""Settings that some recorded runs do not have, with the value that means the same as their absence; the last is gone."""
+"""Settings that some recorded runs do not have, with the value that means the same as their absence.
+
+The last one no longer exists.
+"""
 SHARES = ("trainer.limit_train_batches", "trainer.limit_val_batches")
 """Keys for which 1 and 1.0 differ: 1 is a number of batches, and 1.0 is a share of all batches."""
 

@@ -49,8 +49,8 @@ class Schedule(ABC):
         return self.held if self.held is not None and number > 0 else number
 
 
-def counts(number: float | Tensor) -> bool:
-    """Whether a number of a schedule is above zero, which those in tensors are."""
+def is_positive(number: float | Tensor) -> bool:
+    """Whether the number of a schedule is above zero; a tensor takes its place only then."""
     return isinstance(number, Tensor) or number > 0
 
 
@@ -122,7 +122,7 @@ class Annealing(Schedule):
         return float(self.temperature * (HARDEST / self.temperature) ** (step / self.steps))
 
 
-def soft_minimum(distance: Tensor, temperature: float | Tensor) -> Tensor:
+def soft_minimum(distance: Float[Tensor, "B M ..."], temperature: float | Tensor) -> Float[Tensor, "B ..."]:
     """The soft minimum over dimension 1 at a positive temperature (:class:`Annealing`).
 
     Modes at an infinite distance do not count.
@@ -240,7 +240,7 @@ def _relaxed(
 
     Without relaxation, modes at an infinite distance do not count.
     """
-    return torch.lerp(closest, distance.mean(1), relaxation) if counts(relaxation) else closest
+    return torch.lerp(closest, distance.mean(1), relaxation) if is_positive(relaxation) else closest
 
 
 def scene_imitation(
@@ -259,7 +259,7 @@ def scene_imitation(
     """
     joint = _mean_over_agents(distance, mask)
     closest, mode = joint.min(1)
-    if counts(temperature):
+    if is_positive(temperature):
         closest = soft_minimum(joint, temperature)
     return _relaxed(closest, joint, relaxation).mean(), mode
 
@@ -308,7 +308,7 @@ def marginal_imitation(
     Arguments as of :func:`scene_imitation`.
     """
     closest, mode = distance.min(1)
-    if counts(temperature):
+    if is_positive(temperature):
         closest = soft_minimum(distance, temperature)
     return _mean_over_agents(_relaxed(closest, distance, relaxation), mask).mean(), mode
 
@@ -343,7 +343,7 @@ def marginal_density(
     return _mean_over_agents(surprise(log_density.gather(1, mode[:, None])[:, 0]), mask).mean()
 
 
-def surprise(log_density: Tensor) -> Tensor:
+def surprise(log_density: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
     """-log p. If log p is infinite or NaN, -log of the smallest positive number, without a gradient."""
     least = torch.finfo(log_density.dtype).tiny
     return -torch.where(log_density.isfinite(), log_density, math.log(least))

@@ -39,7 +39,9 @@ from epo_lightning.scene import Scene
 REQUIRED = ("states", "probabilities", "history", "dt")
 OPTIONAL = ("agent_mask", "history_mask", "size", "kind", "id")
 FORECASTS = "forecasts.safetensors"
-"""Name of the file of tensors that ``epo predict`` writes, beside ``index.json``."""
+"""Name of the file of tensors that ``epo predict`` writes."""
+INDEX = "index.json"
+"""Name of the file beside it, which says what the tensors are."""
 _DAMAGED = (OSError, ValueError, EOFError, AttributeError, TypeError, NotImplementedError, RuntimeError)
 """Errors of NumPy and zipfile for damaged archives, beside those of their own."""
 
@@ -159,7 +161,7 @@ def _folder(path: Path) -> dict[str, Any]:
     from safetensors import SafetensorError
     from safetensors.numpy import load_file
 
-    tensors, index = path / FORECASTS, path / "index.json"
+    tensors, index = path / FORECASTS, path / INDEX
     for file in (tensors, index):
         if not file.is_file():
             raise ConfigError(f"{path} lacks {file.name}: give an .npz file, or the folder that `epo predict` wrote")

@@ -75,6 +75,7 @@ class PolylineBackbone(Backbone):
             )
         if not 0 <= self.dropout < 1:
             raise ValueError(f"dropout, the share of features that is left out, must be in [0, 1), not {self.dropout}")
+        # Initial weights are drawn in the order of construction, and checkpoints have modules in that of assignment.
         history = self.history_encoder()
         lanes = LanePolylines(self.lane_width, self.lane_depth, self.scale) if self.map_input else None
         self.history = history

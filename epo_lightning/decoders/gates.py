@@ -76,6 +76,7 @@ class RadiusGate(Gate):
     Args:
         radius: largest gap [m] between the discs at the closest approach.
         group: largest number of agents that are solved together; None for any number.
+        ahead: time [s] ahead within which the closest approach is looked for; 0 for the present distance.
     """
 
     def __init__(self, radius: float = 10.0, group: int | None = None, ahead: float = 0.0) -> None:
@@ -94,6 +95,7 @@ class NearestGate(Gate):
     Args:
         neighbours: k.
         group: largest number of agents that are solved together; None for any number.
+        ahead: time [s] ahead within which the closest approach is looked for; 0 for the present distance.
     """
 
     def __init__(self, neighbours: int = 4, group: int | None = None, ahead: float = 0.0) -> None:
@@ -122,6 +124,7 @@ class AttentionGate(Gate):
         neighbours: k.
         size: D, the size of queries and keys.
         group: largest number of agents that are solved together; None for any number.
+        ahead: time [s] ahead within which the closest approach is looked for; 0 for the present distance.
         width: size of the agent features.
         scale: distance [m] that counts as much as one unit of the score.
     """

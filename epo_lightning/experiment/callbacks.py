@@ -189,7 +189,7 @@ def _without_value(monitor: str, module: LightningModule) -> bool:
 class EpochLines(Callback):
     """Callback that prints one line per validated epoch, for log files and for several runs in one terminal.
 
-    It comes before the losses of the epoch are logged. With several devices, it prints the loss of the first one.
+    The line is printed before the losses of the epoch are logged. With several devices, it prints the loss of the first one.
     """
 
     def __init__(self, title: str, monitor: str) -> None:

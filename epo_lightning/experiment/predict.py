@@ -19,6 +19,7 @@ from epo_lightning.experiment.pictures import choose, draw, forecast_of, pick, s
 from epo_lightning.files import write_file, write_json
 from epo_lightning.forecast import JointForecast
 from epo_lightning.forecasters import Forecaster
+from epo_lightning.predictions import FORECASTS, INDEX
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder
 from epo_lightning.scene import KINDS, Scene
@@ -89,7 +90,7 @@ def predict(settings: PredictSettings, overrides: Sequence[str] = ()) -> list[Pa
 
     run = RunFolder.open(settings.run)
     out = Path(settings.out).expanduser()
-    tensors_file, index_file = out / "forecasts.safetensors", out / "index.json"
+    tensors_file, index_file = out / FORECASTS, out / INDEX
     if index_file.exists():
         raise ConfigError(f"{out} holds forecasts already: nothing is overwritten; choose another out=<folder>")
     of_run = settings_of(run)

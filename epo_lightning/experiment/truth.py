@@ -14,6 +14,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from jaxtyping import Int
 from lightning import LightningModule
 from lightning.pytorch import Callback, Trainer
 from scipy import stats
@@ -28,12 +29,12 @@ OWN = {"goal": "terminal", "vel": "slowness"}
 NEEDED = frozenset({"acc", "turnr"})
 
 
-def inferred_costs(parameters: GameParameters, mode: Tensor) -> dict[str, Tensor]:
+def inferred_costs(parameters: GameParameters, mode: Int[Tensor, " B"]) -> dict[str, Tensor]:
     """Inferred costs [B] by term, in units of the true effort: ``pair``, and the terms of :data:`OWN` that the game has.
 
     Args:
         parameters: the inferred games.
-        mode: index of a mode for every scene [B].
+        mode: index of a mode for every scene.
     """
     rows = torch.arange(len(mode))
     own = {name: weight.abs()[rows, mode].double() for name, weight in parameters.own_weights.items()}

@@ -24,8 +24,8 @@ _STEPS, _DT, _LARGEST = 40, 0.1, 10.0
 _APART = 1e-6
 """Distance between the arguments of a difference quotient."""
 _WRONG = 0.05
-"""Share of the trial values that may have another derivative than their difference quotient: kinks and steps are between
-some of them."""
+"""Share of the trial values whose derivative may differ from their difference quotient, because a kink or a step lies
+between the two arguments."""
 
 
 @cache

@@ -97,7 +97,7 @@ class Conditional(Objective):
             density = losses.marginal_density(tables.log_marginals.transpose(1, 2), closest, mask)
         alone = torch.where(known[:, None, None], (-unary).log_softmax(-1), torch.nan).transpose(1, 2)
         temperature = self.annealing.at(step)
-        if losses.counts(temperature):
+        if losses.is_positive(temperature):
             taught = torch.where(allowed | ~allowed.any(1, keepdim=True), distance, torch.inf)
         else:
             taught = distance.gather(1, closest[:, None])

@@ -70,7 +70,7 @@ class Contrastive(Objective):
         _, mode = losses.scene_imitation(distance, mask)
         controls, missed = observed_controls(energy.dynamics, scene)
         temperature, drawn, game = self.annealing.at(step), solution.controls.detach(), parameters
-        if losses.counts(temperature):
+        if losses.is_positive(temperature):
             share = losses.mode_shares(distance, mask, temperature)
         else:
             index = torch.arange(len(mode), device=mode.device)

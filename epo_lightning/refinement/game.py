@@ -33,8 +33,8 @@ SWERVE = 1e-3
 
 
 def refined(
-    states: Tensor,
-    log_probabilities: Tensor,
+    states: Float[Tensor, "B M N K _"],
+    log_probabilities: Float[Tensor, "B M"],
     scene: Scene,
     energy: Energy,
     weights: Mapping[str, float | Tensor],
@@ -47,6 +47,16 @@ def refined(
     """:func:`~epo_lightning.refinement.refine` without checks of values.
 
     Futures that are not finite give a forecast that is not.
+
+    Args:
+        states: the given futures, x and y [m], or all four entries of the states.
+        log_probabilities: logarithms of their probabilities.
+        scene: the scenes, in the same coordinates.
+        energy: the game that is solved from the given futures.
+        weights, margins: those of the energy, by name: a number for all, or a tensor [B, M, N] or [B, M, P].
+        inverse_temperature: beta, by which an energy above the least one lowers a probability.
+        noise: standard deviation [m] of the given positions.
+        solver, backward: solver of the game and derivative of its solution.
 
     Raises:
         ValueError: an energy, a solver, weights or margins that cannot be used.
@@ -92,7 +102,9 @@ def refined(
 
 
 @torch.no_grad()
-def track(states: Tensor, scene: Scene, dynamics: Dynamics, noise: float) -> Float[Tensor, "B M N K 2"]:
+def track(
+    states: Float[Tensor, "B M N K _"], scene: Scene, dynamics: Dynamics, noise: float
+) -> Float[Tensor, "B M N K 2"]:
     """Controls whose rollouts follow the given futures; zero for absent agents.
 
     Futures with headings and speeds that obey the dynamics are followed exactly, others as closely as ``noise`` asks for.
@@ -109,9 +121,9 @@ def track(states: Tensor, scene: Scene, dynamics: Dynamics, noise: float) -> Flo
     states = torch.where(present[..., None], states, current[..., None, : states.shape[-1]])
     controls = followed_controls(states[..., :2], current, scene.dt, noise)
     if states.shape[-1] == 4:
-        told = controls_between(torch.cat((current[..., None, :], states), -2), scene.dt)
-        missed = (dynamics.rollout(current, told, scene.dt) - states)[..., :2].abs().amax((-2, -1))
-        controls = torch.where((missed < OBEYS)[..., None, None], told, controls)
+        stated = controls_between(torch.cat((current[..., None, :], states), -2), scene.dt)
+        missed = (dynamics.rollout(current, stated, scene.dt) - states)[..., :2].abs().amax((-2, -1))
+        controls = torch.where((missed < OBEYS)[..., None, None], stated, controls)
     return torch.where(present[..., None], controls, 0.0)
 
 

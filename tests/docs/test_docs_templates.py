@@ -42,7 +42,9 @@ def test_a_page_is_rebuilt_from_the_results_files_byte_for_byte(template: Path, 
 
 
 def test_the_list_of_results_files_is_that_of_the_page_of_evidence() -> None:
-    claims, files = ((ROOT / "docs" / f"{page}.md.j2").read_text(encoding="utf-8") for page in ("claims", "results_files"))
+    claims, files = (
+        (ROOT / "docs" / f"{page}.md.j2").read_text(encoding="utf-8") for page in ("claims", "results_files")
+    )
     used = set(re.findall(r'(?:results|folds|transfer)\("(\w+)"', claims))
     assert used
     assert used == {name for name in re.findall(r'"(\w+)"', files) if (ROOT / "results" / f"{name}.json").exists()}

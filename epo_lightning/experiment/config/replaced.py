@@ -21,7 +21,7 @@ SECTIONS = ("data", "optimizer", "trainer", "callbacks")
 def refuse_replaced(values: Mapping[str, Any], overrides: Iterable[str], found: Sequence[Replaced]) -> None:
     """Refuse settings of a file that have no effect, because the budget's file replaces them.
 
-    Default values in the files of :data:`SECTIONS` are not refused: nobody has chosen them.
+    Default values in the files of :data:`SECTIONS` are not refused: the user has not chosen them.
 
     Args:
         values: the resolved configuration.

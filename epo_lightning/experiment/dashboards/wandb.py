@@ -17,6 +17,8 @@ from epo_lightning.experiment.config.settings import WandbSettings
 from epo_lightning.experiment.dashboards.base import ARTIFACTS, Dashboard, Ending, Facts, Row
 from epo_lightning.registry import one_line
 
+PATIENCE = 2.0
+"""Longest wait for an answer of W&B [s]."""
 STEP = "trainer/global_step"
 """The x axis of all curves. W&B's own step counts rows, which has no meaning after `wandb sync` has joined several files."""
 QUIET = {
@@ -159,10 +161,10 @@ def has_key() -> bool:
         return False
 
 
-def answers(patience: float = 2.0) -> bool:
+def answers() -> bool:
     """Whether W&B can be reached. With a key but no network its own start takes two minutes before it gives up."""
     try:
-        urlopen(Request(server(), method="HEAD"), timeout=patience).close()
+        urlopen(Request(server(), method="HEAD"), timeout=PATIENCE).close()
     except HTTPError:
         return True
     except URLError as error:

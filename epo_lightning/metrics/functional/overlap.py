@@ -14,6 +14,8 @@ length times width). Agents that only touch share no area and do not overlap.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -106,9 +108,8 @@ def overlaps(
     Raises:
         ConfigError: an unknown shape.
     """
-    check_choice("shape", shape, SHAPES, of="agents")
+    overlap = _test_of(shape)
     first, second = torch.triu_indices(states.shape[1], states.shape[1], 1, device=states.device)
-    overlap = _discs_overlap if shape == "disc" else _boxes_overlap
     at_step = overlap(states[:, first], states[:, second], size[:, first, None], size[:, second, None])
     return at_step & (agent_mask[:, first] & agent_mask[:, second])[..., None]
 
@@ -125,13 +126,18 @@ def overlaps_with(
     Raises:
         ConfigError: an unknown shape.
     """
-    check_choice("shape", shape, SHAPES, of="agents")
+    overlap = _test_of(shape)
     others = torch.arange(states.shape[1], device=states.device) != agent
-    overlap = _discs_overlap if shape == "disc" else _boxes_overlap
     one = states[:, agent, None].expand(-1, states.shape[1] - 1, -1, -1)
     size_of_one = size[:, agent, None, None].expand(-1, states.shape[1] - 1, -1, -1)
     at_step = overlap(one, states[:, others], size_of_one, size[:, others, None])
     return at_step & (agent_mask[:, others] & agent_mask[:, agent, None])[..., None]
+
+
+def _test_of(shape: str) -> Callable[..., Tensor]:
+    """The function that tests outlines of a shape."""
+    check_choice("shape", shape, SHAPES, of="agents")
+    return _discs_overlap if shape == "disc" else _boxes_overlap
 
 
 def _discs_overlap(

@@ -9,7 +9,7 @@ from __future__ import annotations
 import warnings
 
 import torch
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from epo_lightning.forecast import GameParameters, Solution, Status
@@ -92,7 +92,7 @@ def solution(
     controls: Float[Tensor, "B M N K 2"],
     energies: tuple[Float[Tensor, "B M"], Float[Tensor, "B M"]],
     slope: Float[Tensor, "B M N K 2"],
-    status: Tensor,
+    status: Int[Tensor, "B M"],
 ) -> Solution:
     """The solution with these controls, and the energies before and after the minimisation."""
     return Solution(
@@ -105,7 +105,7 @@ def solution(
     )
 
 
-def first_status(is_finite: Bool[Tensor, "B M"]) -> Tensor:
+def first_status(is_finite: Bool[Tensor, "B M"]) -> Int[Tensor, "B M"]:
     """The initial status: COMPLETED, or STOPPED where energy or gradient are not finite at the start."""
     return torch.where(is_finite, int(Status.COMPLETED), int(Status.STOPPED))
 
