@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from epo_lightning import losses
 from epo_lightning.forecast import JointForecast
+from epo_lightning.schedules import HARDEST, Annealing, ImitationSchedule, Relaxation, schedules_in
 
 MASK = torch.ones(1, 2, 1, dtype=torch.bool)
 DISTANCE = torch.tensor([[[1.0, 5.0], [3.0, 1.0]]])  # [B=1, M=2, N=2]
@@ -60,19 +61,19 @@ def test_agents_without_a_future_do_not_count():
 
 
 def test_relaxation_adds_the_mean_over_modes_and_decays():
-    relaxation = losses.Relaxation(share=0.5, steps=10)
+    relaxation = Relaxation(share=0.5, steps=10)
     assert [relaxation.at(step) for step in (0, 5, 10, 99)] == [0.5, 0.25, 0.0, 0.0]
     joint, mode = losses.scene_imitation(DISTANCE, MASK, 0.5)  # modes are at 3 and 2
     assert (joint.item(), mode.item()) == (2.25, 1)
     marginal, _ = losses.marginal_imitation(DISTANCE, MASK, 0.5)  # closest 1 and 1, means 2 and 3
     assert marginal.item() == 1.75
     with pytest.raises(ValueError, match="relaxation"):
-        losses.Relaxation(share=2.0)
+        Relaxation(share=2.0)
 
 
 def test_a_held_number_takes_the_place_of_the_number_until_it_is_zero():
-    schedule = losses.ImitationSchedule(1.0, losses.Relaxation(0.5, 10), losses.Annealing(2.0, 5))
-    for one in losses.schedules_in(SimpleNamespace(schedule=schedule, other=3)):
+    schedule = ImitationSchedule(1.0, Relaxation(0.5, 10), Annealing(2.0, 5))
+    for one in schedules_in(SimpleNamespace(schedule=schedule, other=3)):
         one.held = torch.tensor(0.25)
     assert schedule.relaxation.at(0) is schedule.relaxation.held
     assert schedule.relaxation.at(10) == 0.0
@@ -84,15 +85,15 @@ def test_a_held_number_takes_the_place_of_the_number_until_it_is_zero():
 
 
 def test_the_temperature_falls_geometrically_to_a_centimetre_and_then_is_zero():
-    annealing = losses.Annealing(temperature=1.0, steps=100)
+    annealing = Annealing(temperature=1.0, steps=100)
     assert [annealing.at(step) for step in (0, 50, 100, 10**6)] == pytest.approx([1.0, 0.1, 0.0, 0.0])
-    assert annealing.at(99) == pytest.approx(losses.HARDEST, rel=0.05)
+    assert annealing.at(99) == pytest.approx(HARDEST, rel=0.05)
     ratios = [annealing.at(step + 1) / annealing.at(step) for step in range(99)]
     assert ratios == pytest.approx([ratios[0]] * 99)
-    assert losses.Annealing().at(0) == 0.0
+    assert Annealing().at(0) == 0.0
     for wrong in ({"temperature": -1.0}, {"temperature": 0.01}, {"temperature": math.inf}, {"steps": 0}):
         with pytest.raises(ValueError, match="annealing"):
-            losses.Annealing(**wrong)
+            Annealing(**wrong)
 
 
 drawn_distances = st.lists(
@@ -140,10 +141,10 @@ def test_annealing_reaches_all_modes_when_hot_and_is_the_hard_loss_when_cold(imi
     joint = distance.detach().mean(2, keepdim=True).expand_as(distance)
     far = joint if imitation is losses.scene_imitation else distance.detach()
     torch.testing.assert_close(of_hot, far / 1e3 / 6, rtol=1e-2, atol=0)  # of the mean of d^2 / (2 T)
-    cold, _ = imitation(distance, MASK, temperature=losses.HARDEST)
+    cold, _ = imitation(distance, MASK, temperature=HARDEST)
     (of_cold,) = torch.autograd.grad(cold, distance)
     torch.testing.assert_close(of_cold, of_hard, rtol=0, atol=1e-4)
-    assert cold.item() == pytest.approx(hard.item(), abs=2 * losses.HARDEST)
+    assert cold.item() == pytest.approx(hard.item(), abs=2 * HARDEST)
     off, _ = imitation(distance, MASK, temperature=0.0)
     assert torch.equal(torch.autograd.grad(off, distance)[0], of_hard)
     assert torch.equal(off, hard)
@@ -160,11 +161,11 @@ def test_a_very_distant_mode_changes_no_soft_minimum(far):
 
 
 def test_a_power_other_than_one_and_a_temperature_in_metres_exclude_each_other():
-    never = losses.Relaxation()
-    assert losses.ImitationSchedule(1.0, never, losses.Annealing(0.3)).at(0) == (1.0, 0.0, 0.3)
-    assert losses.ImitationSchedule(2.0, never, losses.Annealing()).at(0) == (2.0, 0.0, 0.0)
+    never = Relaxation()
+    assert ImitationSchedule(1.0, never, Annealing(0.3)).at(0) == (1.0, 0.0, 0.3)
+    assert ImitationSchedule(2.0, never, Annealing()).at(0) == (2.0, 0.0, 0.0)
     with pytest.raises(ValueError, match=r"annealing=0.3 and power=1.05 exclude each other"):
-        losses.ImitationSchedule(1.05, never, losses.Annealing(0.3))
+        ImitationSchedule(1.05, never, Annealing(0.3))
 
 
 def test_modes_at_an_infinite_distance_do_not_count():
@@ -192,7 +193,7 @@ def test_a_scene_without_observations_has_no_loss_when_annealed():
         assert imitation(torch.zeros(1, 2, 2), torch.zeros_like(MASK), temperature=1.0)[0] == 0.0
 
 
-def after_training(annealing: losses.Annealing) -> list[float]:
+def after_training(annealing: Annealing) -> list[float]:
     """Where two modes end that start at 0.9 m and 6 m, if half of the futures are at -1 m and the others at 1 m."""
     modes = torch.tensor([0.9, 6.0], dtype=torch.float64, requires_grad=True)
     future = torch.zeros(2, 1, 1, 4, dtype=torch.float64)
@@ -210,10 +211,10 @@ def after_training(annealing: losses.Annealing) -> list[float]:
 
 
 def test_the_hard_loss_collapses_where_the_annealed_one_teaches_both_modes():
-    near, far = after_training(losses.Annealing())
+    near, far = after_training(Annealing())
     assert far == 6.0, "the mode that is never the closest has not moved"
     assert -1.1 < near < 1.1
-    assert after_training(losses.Annealing(10.0, 300)) == pytest.approx([-1.0, 1.0], abs=0.11)
+    assert after_training(Annealing(10.0, 300)) == pytest.approx([-1.0, 1.0], abs=0.11)
 
 
 def test_probabilities_are_scored_at_the_closest_mode():

@@ -23,9 +23,9 @@ from torch import Tensor, nn
 
 from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.forecasters import Forecaster
-from epo_lightning.losses import Schedule
 from epo_lightning.registry import ConfigError, one_line
 from epo_lightning.scene import FIELDS, Scene
+from epo_lightning.schedules import Schedule
 
 WARM_UP = 3
 """Training steps before the capture: they compile kernels and make handles of libraries, which a capture cannot contain."""

@@ -14,12 +14,12 @@ from epo_lightning import doubts
 from epo_lightning.decoders.weights import SharedWeights
 from epo_lightning.forecast import JointForecast
 from epo_lightning.forecasters.step_means import StepMeans
-from epo_lightning.losses import Schedule, schedules_in
 from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.metrics.forecast import COLUMNS, STOPPED, stopped
 from epo_lightning.objectives.base import Terms
 from epo_lightning.optimizers import Adam
 from epo_lightning.scene import Scene
+from epo_lightning.schedules import Schedule, schedules_in
 from epo_lightning.solvers.base import Minimiser
 from epo_lightning.task import Task
 

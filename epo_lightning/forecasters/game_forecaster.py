@@ -7,9 +7,9 @@ import dataclasses
 from epo_lightning.forecast import JointForecast
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.game.energy import Energy
-from epo_lightning.losses import Schedule, schedules_in
 from epo_lightning.objectives.base import Objective, Terms
 from epo_lightning.scene import Scene
+from epo_lightning.schedules import Schedule, schedules_in
 from epo_lightning.solvers.backward import Backward
 from epo_lightning.solvers.base import Minimiser
 

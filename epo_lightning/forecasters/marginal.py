@@ -17,6 +17,7 @@ from epo_lightning.objectives.base import Terms, checked_weights
 from epo_lightning.optimizers import Adam
 from epo_lightning.registry import register
 from epo_lightning.scene import Scene, observed_future
+from epo_lightning.schedules import Annealing, ImitationSchedule, Relaxation
 from epo_lightning.task import Task
 
 
@@ -32,8 +33,8 @@ class Marginal(Forecaster):
         backbone: the observation encoder.
         modes: number M of modes.
         loss_weights: lambda of ``imitation`` and ``probability``.
-        relaxation, relaxation_steps: see :class:`~epo_lightning.losses.Relaxation`.
-        annealing, annealing_steps: temperature [m] and duration of an :class:`~epo_lightning.losses.Annealing`.
+        relaxation, relaxation_steps: see :class:`~epo_lightning.schedules.Relaxation`.
+        annealing, annealing_steps: temperature [m] and duration of an :class:`~epo_lightning.schedules.Annealing`.
         power: 1 for Euclidean distances; above, exponent of each coordinate's error; see
             :func:`~epo_lightning.losses.distances`.
     """
@@ -54,8 +55,8 @@ class Marginal(Forecaster):
         super().__init__(task, optimizer)
         self.backbone = backbone
         self.loss_weights = checked_weights(loss_weights, ("imitation", "probability"), "forecaster.loss_weights")
-        self.schedule = losses.ImitationSchedule(
-            power, losses.Relaxation(relaxation, relaxation_steps), losses.Annealing(annealing, annealing_steps)
+        self.schedule = ImitationSchedule(
+            power, Relaxation(relaxation, relaxation_steps), Annealing(annealing, annealing_steps)
         )
         self.decoder = Trajectories(backbone.width, modes, task.horizon, task.scale)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from epo_lightning import losses
 from epo_lightning.backbones.base import Backbone
 from epo_lightning.checks import check_choice
 from epo_lightning.decoders.probabilities import PROBABILITIES
@@ -17,6 +16,7 @@ from epo_lightning.objectives.terms import imitation_terms
 from epo_lightning.optimizers import Adam
 from epo_lightning.registry import register
 from epo_lightning.scene import Scene
+from epo_lightning.schedules import Annealing, ImitationSchedule, Relaxation
 from epo_lightning.task import Task
 
 
@@ -30,8 +30,8 @@ class SceneConsistent(Forecaster):
         modes: number M of joint modes.
         loss_weights: lambda of ``imitation`` and ``probability``.
         control_scale: control at a network output of one.
-        relaxation, relaxation_steps: see :class:`~epo_lightning.losses.Relaxation`.
-        annealing, annealing_steps: temperature [m] and duration of an :class:`~epo_lightning.losses.Annealing`.
+        relaxation, relaxation_steps: see :class:`~epo_lightning.schedules.Relaxation`.
+        annealing, annealing_steps: temperature [m] and duration of an :class:`~epo_lightning.schedules.Annealing`.
         power: 1 for Euclidean distances; above, exponent of each coordinate's error; see
             :func:`~epo_lightning.losses.distances`.
         probabilities: decoder of the modes' probabilities, ``linear`` (the paper's) or ``pairwise``
@@ -59,8 +59,8 @@ class SceneConsistent(Forecaster):
         self.backbone = backbone
         self.dynamics = dynamics
         self.loss_weights = checked_weights(loss_weights, ("imitation", "probability"), "forecaster.loss_weights")
-        self.schedule = losses.ImitationSchedule(
-            power, losses.Relaxation(relaxation, relaxation_steps), losses.Annealing(annealing, annealing_steps)
+        self.schedule = ImitationSchedule(
+            power, Relaxation(relaxation, relaxation_steps), Annealing(annealing, annealing_steps)
         )
         self.strategies = InitialStrategies(backbone.width, modes, task.horizon, control_scale)
         self.probabilities = PROBABILITIES[probabilities](backbone.width, modes, task.horizon, task.scale)

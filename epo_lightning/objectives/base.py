@@ -50,7 +50,7 @@ class Objective(ABC):
                 the initial strategies through the solution.
             energy: the energy that was minimised.
             step: number of optimisation steps so far. In a CUDA graph, a number that is computed from it stays the same,
-                unless it is that of a :class:`~epo_lightning.losses.Schedule` among the attributes of the objective.
+                unless it is that of a :class:`~epo_lightning.schedules.Schedule` among the attributes of the objective.
 
         Raises:
             ValueError: the scene has no future.

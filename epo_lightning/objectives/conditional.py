@@ -14,6 +14,7 @@ from epo_lightning.objectives.base import Objective, Terms, checked_weights
 from epo_lightning.objectives.terms import goal_term
 from epo_lightning.registry import ConfigError, nearest, register
 from epo_lightning.scene import Scene, observed_future
+from epo_lightning.schedules import Annealing, is_positive
 from epo_lightning.solvers.base import TABLES
 from epo_lightning.solvers.discrete import assignments
 
@@ -47,7 +48,7 @@ class Conditional(Objective):
             decoded candidates and elsewhere measures how well the candidates cover the observed futures; and of ``goal``
             (unused where no goal is decoded; 0.1 where it is not named).
         density: ``joint`` or ``marginal``.
-        annealing, annealing_steps: temperature [m] and duration of an :class:`~epo_lightning.losses.Annealing` of
+        annealing, annealing_steps: temperature [m] and duration of an :class:`~epo_lightning.schedules.Annealing` of
             ``regression``, over the candidates of each agent.
     """
 
@@ -66,7 +67,7 @@ class Conditional(Objective):
             raise ConfigError(f"unknown objective.density {density!r}: {nearest(str(density), DENSITIES)}")
         self.weights = checked_weights({"goal": GOAL, **weights}, self.term_names)
         self.density = density
-        self.annealing = losses.Annealing(annealing, annealing_steps)
+        self.annealing = Annealing(annealing, annealing_steps)
 
     def __call__(self, scene: Scene, forecast: JointForecast, energy: Energy, step: int = 0) -> Terms:
         """The terms of a batch; see :meth:`Objective.__call__`.
@@ -97,7 +98,7 @@ class Conditional(Objective):
             density = losses.marginal_density(tables.log_marginals.transpose(1, 2), closest, mask)
         alone = torch.where(known[:, None, None], (-unary).log_softmax(-1), torch.nan).transpose(1, 2)
         temperature = self.annealing.at(step)
-        if losses.is_positive(temperature):
+        if is_positive(temperature):
             taught = torch.where(allowed | ~allowed.any(1, keepdim=True), distance, torch.inf)
         else:
             taught = distance.gather(1, closest[:, None])

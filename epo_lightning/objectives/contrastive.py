@@ -25,6 +25,7 @@ from epo_lightning.objectives.base import Objective, Terms, checked_weights
 from epo_lightning.objectives.terms import goal_term
 from epo_lightning.registry import register
 from epo_lightning.scene import Scene, observed_future
+from epo_lightning.schedules import Annealing, is_positive
 from epo_lightning.solvers.base import PATH, SAMPLES, STATIONARY
 
 
@@ -49,7 +50,7 @@ class Contrastive(Objective):
             of ``initial``, the distance between initial strategies and samples (cooperative
             training: the network learns to start the chains where they end); of ``goal`` (unused if no goal is decoded);
             and of ``probability``, the cross entropy of the closest mode.
-        annealing, annealing_steps: temperature [m] and duration of an :class:`~epo_lightning.losses.Annealing`.
+        annealing, annealing_steps: temperature [m] and duration of an :class:`~epo_lightning.schedules.Annealing`.
     """
 
     term_names = ("contrastive", "magnitude", "initial", "goal", "probability")
@@ -58,7 +59,7 @@ class Contrastive(Objective):
 
     def __init__(self, weights: Mapping[str, float], annealing: float = 0.0, annealing_steps: int = 2000) -> None:
         self.weights = checked_weights(weights, self.term_names)
-        self.annealing = losses.Annealing(annealing, annealing_steps)
+        self.annealing = Annealing(annealing, annealing_steps)
 
     def __call__(self, scene: Scene, forecast: JointForecast, energy: Energy, step: int = 0) -> Terms:
         future, mask = observed_future(scene)
@@ -70,7 +71,7 @@ class Contrastive(Objective):
         _, mode = losses.scene_imitation(distance, mask)
         controls, missed = observed_controls(energy.dynamics, scene)
         temperature, drawn, game = self.annealing.at(step), solution.controls.detach(), parameters
-        if losses.is_positive(temperature):
+        if is_positive(temperature):
             share = losses.mode_shares(distance, mask, temperature)
         else:
             index = torch.arange(len(mode), device=mode.device)

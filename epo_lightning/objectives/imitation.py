@@ -9,7 +9,6 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from epo_lightning import losses
 from epo_lightning.decoders.orders import order_loss
 from epo_lightning.forecast import JointForecast
 from epo_lightning.game.energy import Energy
@@ -17,6 +16,7 @@ from epo_lightning.objectives.base import Objective, Terms, checked_weights
 from epo_lightning.objectives.terms import goal_term, imitation_terms
 from epo_lightning.registry import register
 from epo_lightning.scene import Scene
+from epo_lightning.schedules import Annealing, ImitationSchedule, Relaxation
 
 
 @register("objective", "imitation")
@@ -29,8 +29,8 @@ class Imitation(Objective):
             solution (``truncated``, ``implicit``). If games go on after the forecast, it also compares the initial controls
             after the forecast with those of the solution, because there are no data for them. If orders of agents are
             decoded, ``probability`` is their cross entropy.
-        relaxation, relaxation_steps: see :class:`~epo_lightning.losses.Relaxation`.
-        annealing, annealing_steps: temperature [m] and duration of an :class:`~epo_lightning.losses.Annealing`.
+        relaxation, relaxation_steps: see :class:`~epo_lightning.schedules.Relaxation`.
+        annealing, annealing_steps: temperature [m] and duration of an :class:`~epo_lightning.schedules.Annealing`.
         power: 1 for Euclidean distances; above, exponent of each coordinate's error; see
             :func:`~epo_lightning.losses.distances`.
     """
@@ -49,8 +49,8 @@ class Imitation(Objective):
         annealing_steps: int = 2000,
     ) -> None:
         self.weights = checked_weights(weights, self.term_names)
-        self.schedule = losses.ImitationSchedule(
-            power, losses.Relaxation(relaxation, relaxation_steps), losses.Annealing(annealing, annealing_steps)
+        self.schedule = ImitationSchedule(
+            power, Relaxation(relaxation, relaxation_steps), Annealing(annealing, annealing_steps)
         )
 
     def __call__(self, scene: Scene, forecast: JointForecast, energy: Energy, step: int = 0) -> Terms:

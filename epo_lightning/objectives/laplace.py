@@ -36,6 +36,7 @@ from epo_lightning.objectives.base import Objective, Terms, checked_weights
 from epo_lightning.objectives.terms import goal_term
 from epo_lightning.registry import register
 from epo_lightning.scene import Scene, observed_future
+from epo_lightning.schedules import Annealing
 from epo_lightning.solvers.base import PATH, SAMPLES, STATIONARY
 from epo_lightning.solvers.gauss_newton.normal_equations import by_channel, normal_equations
 from epo_lightning.solvers.general import dense
@@ -58,7 +59,7 @@ class Laplace(Objective):
         weights: lambda of ``density``; of ``initial``, minSADE of the initial strategies, which the likelihood does not
             train; and of ``goal`` (no effect where no goal is decoded).
         damping: eps, which keeps H positive definite if some controls have no effect on any feature.
-        annealing, annealing_steps: temperature [m] and duration of an :class:`~epo_lightning.losses.Annealing` of
+        annealing, annealing_steps: temperature [m] and duration of an :class:`~epo_lightning.schedules.Annealing` of
             ``initial``. (``density`` trains every mode by its own share in the mixture.)
     """
 
@@ -76,7 +77,7 @@ class Laplace(Objective):
         check_number("objective.damping", damping, zero=True)
         self.weights = checked_weights(weights, self.term_names)
         self.damping = damping
-        self.annealing = losses.Annealing(annealing, annealing_steps)
+        self.annealing = Annealing(annealing, annealing_steps)
 
     def __call__(self, scene: Scene, forecast: JointForecast, energy: Energy, step: int = 0) -> Terms:
         future, mask = observed_future(scene)

@@ -9,6 +9,7 @@ from epo_lightning.decoders.goals import goal_candidates
 from epo_lightning.forecast import JointForecast
 from epo_lightning.objectives.base import Terms
 from epo_lightning.scene import Scene, observed_future
+from epo_lightning.schedules import Softness
 
 
 def goal_term(scene: Scene, forecast: JointForecast, weight: float) -> Terms:
@@ -24,7 +25,7 @@ def imitation_terms(
     scene: Scene,
     forecast: JointForecast,
     weights: Mapping[str, float],
-    softness: losses.Softness,
+    softness: Softness,
 ) -> Terms:
     """Distance of the closest joint future, and the cross entropy of its probability, which is always that of the closest.
 

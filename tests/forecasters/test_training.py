@@ -12,13 +12,13 @@ from games import random_scene
 from suites import IMITATION, LOSS_WEIGHTS, model
 from torch.utils.data import DataLoader
 
-from epo_lightning import losses
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.compose import compose
 from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.forecasters import Forecaster, build_forecaster
 from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.scene import Scene
+from epo_lightning.schedules import Annealing, Relaxation
 from epo_lightning.schema import read
 
 BATCHES, EPOCHS = 2, 2
@@ -98,8 +98,8 @@ def test_gradients_are_clipped_to_the_configured_norm() -> None:
 @pytest.mark.parametrize("name", LEARNED)
 def test_the_relaxation_fades_with_optimisation_steps(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     steps: list[int] = []
-    share = losses.Relaxation.at
-    monkeypatch.setattr(losses.Relaxation, "at", lambda self, step: (steps.append(step), share(self, step))[1])
+    share = Relaxation.at
+    monkeypatch.setattr(Relaxation, "at", lambda self, step: (steps.append(step), share(self, step))[1])
     fit(build(name), limit_val_batches=0)
     assert steps == list(range(BATCHES * EPOCHS))
 
@@ -117,8 +117,8 @@ ANNEALED = {
 @pytest.mark.parametrize("name", ANNEALED)
 def test_the_temperature_falls_with_optimisation_steps(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     steps: list[int] = []
-    at = losses.Annealing.at
-    monkeypatch.setattr(losses.Annealing, "at", lambda self, step: (steps.append(step), at(self, step))[1])
+    at = Annealing.at
+    monkeypatch.setattr(Annealing, "at", lambda self, step: (steps.append(step), at(self, step))[1])
     torch.manual_seed(1)
     fit(build_forecaster(model(**ANNEALED[name])), limit_val_batches=0)
     assert steps == list(range(BATCHES * EPOCHS))

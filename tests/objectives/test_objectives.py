@@ -18,6 +18,7 @@ from epo_lightning.objectives.imitation import _difference_ahead
 from epo_lightning.objectives.terms import imitation_terms
 from epo_lightning.registry import build, parts
 from epo_lightning.scene import Scene
+from epo_lightning.schedules import Softness
 
 
 def test_the_difference_after_the_forecast_is_a_mean_over_scenes() -> None:
@@ -174,7 +175,7 @@ def test_imitation_takes_the_closest_mode_and_a_share_of_all_with_distances_to_a
     forecast = JointForecast(scene.future[:, None] + offset, torch.tensor([[0.75, 0.25]]))
     weights = {"imitation": 1.0, "probability": 0.1}
     for relaxation, power in ((0.0, 1.0), (0.5, 1.0), (0.0, 2.0), (0.5, 2.0)):
-        terms = imitation_terms(scene, forecast, weights, losses.Softness(power, relaxation))
+        terms = imitation_terms(scene, forecast, weights, Softness(power, relaxation))
         # Euclidean, or the mean of both coordinates to the power.
         both = 1.0 if power == 1.0 else (0.6**power + 0.8**power) / 2
         far, closest = 2.0**power * both, both
