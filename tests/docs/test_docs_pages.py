@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import re
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -58,6 +59,15 @@ def test_paths_exist(page: Path) -> None:
     for path in re.findall(rf"`((?:{FOLDERS})/[\w./-]+)`", text):
         made = Path(path).stem in EXAMPLES or (ROOT / path).is_relative_to(GENERATED)
         assert made or (ROOT / path).exists(), path
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_empty_lines_are_around_tables(page: Path) -> None:
+    """A sentence directly below a table would be one of its rows, and a table directly below a sentence a part of it."""
+    text = re.sub(r"^```.*?^```$", "```", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    lines = [line.strip() for line in text.splitlines()]
+    joined = [two for two in pairwise(lines) if all(two) and two[0].startswith("|") != two[1].startswith("|")]
+    assert joined == []
 
 
 def test_every_page_is_in_the_table_of_contents() -> None:
