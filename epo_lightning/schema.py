@@ -84,7 +84,8 @@ def describe(hint: Any) -> str:
     """Description of a type for messages about YAML files, such as ``a whole number``."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
-        return " or ".join(describe(option) for option in arguments)
+        options = list(dict.fromkeys(map(describe, arguments)))
+        return (", or " if any("," in option for option in options) else " or ").join(options)
     if origin is Literal:
         return "one of " + ", ".join(str(option) for option in arguments)
     names = {int: "a whole number", float: "a number", bool: "true or false", str: "text", type(None): "null"}

@@ -271,23 +271,27 @@ def configs(root: Path, kind: str) -> list[tuple[Path, dict[str, Any]]]:
 
 
 def verify_file(folder: Path, split: str, command: str = "", config: Mapping[str, Any] | None = None) -> Path:
-    """The path of a split's file after a check of its size and checksum (a few tenths of a second per 100 MB at most).
+    """The path of a split's file after a check of the sizes of all files, and of its checksum.
+
+    A checksum takes a few tenths of a second per 100 MB at most.
 
     The checksum of a large file that :func:`load` has checked is not computed again, unless the file has changed since.
 
     Raises:
-        CacheError: as :func:`manifest`, or a file that is missing, truncated or altered.
+        CacheError: as :func:`manifest`, or a file that is missing or truncated, or this one is altered.
     """
     files = manifest(folder, command, config)["files"]
     path = folder / f"{split}.safetensors"
     if path.name not in files:
         raise CacheError(f"{folder} has no split {split!r}; it has " + ", ".join(Path(name).stem for name in files))
-    expected = files[path.name]
-    if not path.is_file():
-        raise _broken(f"{path} is missing", folder, command)
-    if path.stat().st_size != expected["bytes"]:
-        raise _broken(f"{path} has {path.stat().st_size} bytes instead of {expected['bytes']}", folder, command)
-    if not _is_checked(path, expected["sha256"]) and file_digest(path) != expected["sha256"]:
+    for name, expected in files.items():  # of all splits: a damaged test split is found before a training
+        file = folder / name
+        if not file.is_file():
+            raise _broken(f"{file} is missing", folder, command)
+        if file.stat().st_size != expected["bytes"]:
+            raise _broken(f"{file} has {file.stat().st_size} bytes instead of {expected['bytes']}", folder, command)
+    checksum = files[path.name]["sha256"]
+    if not _is_checked(path, checksum) and file_digest(path) != checksum:
         raise _broken(
             f"{path} has the right size but not the checksum of its manifest: it was altered", folder, command
         )

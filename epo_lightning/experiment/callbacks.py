@@ -195,7 +195,7 @@ class EpochLines(Callback):
     def __init__(self, title: str, monitor: str) -> None:
         self._title, self._monitor = title, monitor
         self._best = math.inf
-        self._validated = False
+        self._validated: int | None = None
         self._started = time.monotonic()
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -205,12 +205,12 @@ class EpochLines(Callback):
                 self._best = float(kept.best_model_score)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._validated = not trainer.sanity_checking
+        self._validated = None if trainer.sanity_checking else trainer.global_step
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if not self._validated:
+        if (validated := self._validated) is None:
             return
-        self._validated = False
+        self._validated = None
         metrics = trainer.callback_metrics
         lost = _without_value(self._monitor, pl_module)
         value = math.nan if lost else float(metrics.get(self._monitor, math.nan))
@@ -218,9 +218,10 @@ class EpochLines(Callback):
         means: StepMeans = pl_module.step_means  # type: ignore[assignment]
         loss = float(means.means().get("train/loss", math.nan))
         epochs = f"/{trainer.max_epochs}" if trainer.max_epochs and trainer.max_epochs > 0 else ""
+        at = f"at step {validated}, " if validated < trainer.global_step else ""  # the epoch went on after it
         print(
             f"{self._title}: epoch {trainer.current_epoch + 1}{epochs}, step {trainer.global_step}, loss {loss:.4f}, "
-            f"{self._monitor} {value:.4f} (best {self._best:.4f}), {time.monotonic() - self._started:.0f} s",
+            f"{self._monitor} {value:.4f} ({at}best {self._best:.4f}), {time.monotonic() - self._started:.0f} s",
             flush=True,
         )
 

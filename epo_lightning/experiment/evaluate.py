@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -131,6 +132,10 @@ def score(
     """
     if not run.finished:
         raise ConfigError(f"{run.path} is not finished: continue it with `epo train resume={run.path}`")
+    if not pretrained.ships(run.path) and not os.access(run.path, os.W_OK):
+        raise ConfigError(
+            f"{run.path} cannot be written, and its scores are kept there: score a copy that you may write"
+        )
     of_run = settings_of(run)
     checkpoint = run.checkpoint(settings.checkpoint)
     forecaster = open_checkpoint(of_run, checkpoint)

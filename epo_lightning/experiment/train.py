@@ -245,7 +245,7 @@ def _best_score(run: RunFolder, trainer: Trainer, monitor: str) -> float:
     if score is None and monitor not in trainer.callback_metrics:
         raise ConfigError(
             f"{run.path}: the training ended after {trainer.global_step} steps, before its first validation: validate more "
-            "often (trainer.validate_every, trainer.validate_steps) or take more steps (trainer.max_steps)"
+            "often (trainer.validate_every, trainer.validate_steps) or train longer (trainer.max_steps, trainer.max_epochs)"
         )
     score = float(trainer.callback_metrics.get(monitor, math.nan)) if score is None else score
     if not math.isfinite(score):

@@ -24,6 +24,9 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     """
     path = Path(path)
     if not path.is_file():
+        others = sorted(file.name for file in path.parent.glob("*.ckpt"))
+        if others:
+            raise ConfigError(f"no checkpoint at {path}; the folder has {', '.join(others)}")
         raise ConfigError(
             f"no checkpoint at {path}: give the path of a .ckpt file, such as RUN/checkpoints/best.ckpt, or the name of a "
             f"forecaster that ships with the package ({nearest(str(path), names())})"

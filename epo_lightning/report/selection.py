@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import re
 import shlex
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from epo_lightning.checks import is_number
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.labels import natural, value_text
 from epo_lightning.report.rows import BATCH, Row, plain_rows, require_comparable, setting
@@ -77,6 +79,22 @@ def best_settings(runs: Iterable[EvaluatedRun], metric: str = "minSADE") -> list
     return [_best(members, rows, metric) for members, rows in searched if any(map(_is_searched, rows[0].settings))]
 
 
+def at_edge(best: BestSetting) -> list[str]:
+    """Notes on numbers of the best setting that are the smallest or the largest of three or more that were tried."""
+    notes = []
+    for key, value in best.row.settings.items():
+        tried = {row.settings[key] for row in best.compared if is_number(row.settings.get(key))}
+        if not _is_searched(key) or len(tried) < 3 or value not in (min(tried), max(tried)):
+            continue
+        which, other = ("largest", "larger") if value == max(tried) else ("smallest", "smaller")
+        if value != 0:
+            notes.append(
+                f"Best setting of {best.title}: {key}={value_text(value)} is the {which} of {len(tried)} values that were "
+                f"tried; {other} ones may be better."
+            )
+    return notes
+
+
 def _is_searched(key: str) -> bool:
     return (key.split(".")[0] in SEARCHED and key != "forecaster.modes") or key == BATCH
 
@@ -129,12 +147,17 @@ def _overrides(row: Row) -> tuple[str, ...]:
 
 
 def _row(run: EvaluatedRun, overrides: Iterable[str]) -> list[str]:
-    """Overrides that choose the row of a run: its experiment or, without one, the parts that no other override chooses."""
+    """Overrides that choose the row of a run: its experiment or, without one, the parts that no other override chooses; and
+    its data.
+    """
+    chosen = {_key(override) for override in overrides}
     if not run.experiment:
         parts = {"data": data_option(run.config["data"]), "backbone": run.backbone, "forecaster": run.forecaster}
-        chosen = {override.partition("=")[0] for override in overrides}
         return [f"{group}={option}" for group, option in parts.items() if group not in chosen]
-    return [
-        f"experiment={run.experiment}",
-        *([f"data={data_option(run.config['data'])}"] if run.config["data"].get("split") == "hard" else []),
-    ]
+    given = [word for word in shlex.split(run.command) if re.match(r"\+*data[.=]", word) and _key(word) not in chosen]
+    hard = [f"data={data_option(run.config['data'])}"] if run.config["data"].get("split") == "hard" else []
+    return [f"experiment={run.experiment}", *(given or hard)]
+
+
+def _key(override: str) -> str:
+    return override.lstrip("+").partition("=")[0]

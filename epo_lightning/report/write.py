@@ -36,7 +36,7 @@ from epo_lightning.report.render import (
     without_html,
 )
 from epo_lightning.report.runs import EvaluatedRun, collect, find_runs, read_parts, scored, scored_elsewhere
-from epo_lightning.report.selection import BestSetting, best_settings
+from epo_lightning.report.selection import BestSetting, at_edge, best_settings
 from epo_lightning.report.statistics import Comparisons, build_comparisons
 from epo_lightning.report.tables import Table, build_tables, distinct
 from epo_lightning.report.timings import places, read_timings, timing_sheet
@@ -213,6 +213,7 @@ def _gather(report: Report, notes: Sequence[str]) -> _Found:
             *notes,
             *damaged,
             *([hint] if hint else []),
+            *(note for setting in best for note in at_edge(setting)),
         ],
     )
 

@@ -102,7 +102,7 @@ MISTAKES = {
     "evaluate runs=.": "no finished run",
     "evaluate runs=nowhere": "no folder nowhere of runs: it does not exist",
     "report rpi_mainn": "none has, `epo sweep` lists those that can be begun",
-    "evaluate run=a split=tset": "split must be one of test, val, train, all or null",
+    "evaluate run=a split=tset": "split must be one of test, val, train, all, or null",
     "evaluate run=a split=train": "split=train needs data=<data set>",
     "predict": "run=<run folder>",
     "report runs=nowhere": "nowhere",

@@ -10,7 +10,7 @@ import pytest
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.render import settings_sheet, to_markdown
 from epo_lightning.report.runs import collect
-from epo_lightning.report.selection import BestSetting, best_settings
+from epo_lightning.report.selection import BestSetting, at_edge, best_settings
 
 from .run_folders import make_run, scores
 
@@ -70,6 +70,27 @@ def test_the_command_names_a_data_set_as_it_is_chosen_and_not_as_tables_call_it(
     (found,) = best(tmp_path)
     assert found.row.runs[0].data == "rpi_hard, recipe 2"
     assert found.words == "experiment=rpi/v_lstm data=rpi_hard optimizer.lr=0.01"
+
+
+def test_words_about_the_data_of_a_search_belong_to_the_best_setting(tmp_path: Path) -> None:
+    """A part of a data set has the settings of the whole one, and cannot be told from it by the configuration."""
+    searched(
+        tmp_path, "experiment=rpi/v_lstm data=rpi_hard_reduced +data.share=0.5 budget=short", **{"data.split": "hard"}
+    )
+    (found,) = best(tmp_path)
+    assert found.words == "experiment=rpi/v_lstm data=rpi_hard_reduced +data.share=0.5 optimizer.lr=0.002"
+
+
+def test_a_best_value_at_the_edge_of_those_tried_is_noted(tmp_path: Path) -> None:
+    search(tmp_path / "edge", {(lr, 64): [error] for lr, error in ((0.001, 0.3), (0.002, 0.2), (0.004, 0.1))})
+    (note,) = at_edge(*best(tmp_path / "edge"))
+    assert note == (
+        "Best setting of V-LSTM: optimizer.lr=0.004 is the largest of 3 values that were tried; larger ones may be better."
+    )
+    search(tmp_path / "inside", {(lr, 64): [error] for lr, error in ((0.001, 0.3), (0.002, 0.1), (0.004, 0.2))})
+    search(tmp_path / "two", {(0.001, 64): [0.2], (0.002, 64): [0.1]})
+    search(tmp_path / "zero", {(lr, 64): [0.1 + lr] for lr in (0.0, 0.1, 0.2)})
+    assert [at_edge(*best(tmp_path / name)) for name in ("inside", "two", "zero")] == [[], [], []]
 
 
 def test_the_test_split_never_chooses(tmp_path: Path) -> None:
@@ -157,7 +178,7 @@ def test_settings_that_a_search_fixes_belong_to_the_best_setting(tmp_path: Path)
         )  # fmt: skip
     (found,) = best(tmp_path)
     chosen = "backbone.width=64 data.batch_size=16 ++optimizer.clip=0.5 optimizer.lr=0.002"
-    assert found.words == f"experiment=rpi/v_lstm {chosen}"
+    assert found.words == f"experiment=rpi/v_lstm data.placements=8 {chosen}"
     assert found.overrides == tuple(chosen.split())
 
 

@@ -181,7 +181,7 @@ def result(job: Job) -> str:
         told = [f"{best[0]} {best[1]:.4f}"] if best else []
         if "test" in job.measures:
             told.append(f"test/minSADE {read_json(job.run.metrics_file('test'))['metrics']['minSADE']:.4f}")
-        told.append(duration_text(record.get("seconds", 0.0)))
+        told.append(f"{duration_text(record.get('seconds', 0.0))} of training")
     if "time" in job.measures:
         seconds = read_json(job.run.metrics_file("time"))["seconds"]["median"]
         told.append(f"{1000 * seconds:.1f} ms per forecast")
