@@ -15,14 +15,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from benchmarks.command_line import parser_of
+from benchmarks.runs import name_of, opened
 from epo_lightning.experiment import assembly
-from epo_lightning.experiment.config.settings import Settings
-from epo_lightning.experiment.opening import open_checkpoint, open_data, settings_of, split_of
+from epo_lightning.experiment.opening import open_data, split_of
 from epo_lightning.forecast import JointForecast
 from epo_lightning.metrics.functional.displacement import closest_mode
 from epo_lightning.registry import ConfigError
-from epo_lightning.report.runs import data_name
-from epo_lightning.run_folder import RunFolder
 from epo_lightning.scene import HEADING, Scene
 
 COLUMNS = ("along", "across", "ahead")
@@ -50,12 +48,6 @@ def errors(scene: Scene, forecast: JointForecast) -> Float[Tensor, "B 3"]:
     return values[known].sum(1) / counted[known].sum(1, keepdim=True)
 
 
-def name_of(settings: Settings, split: str) -> str:
-    """Title and seed of a run, and the groups of its test split, or its data set if they were drawn."""
-    groups = ", ".join(map(str, settings.data.get("test") or ()))
-    return f"{settings.title}, seed {settings.seed}, {split} of {groups or data_name(settings.data)}"
-
-
 @torch.no_grad()
 def scores(folder: str) -> tuple[str, int, list[float]]:
     """Name of a run, its number of scenes, and the values of :data:`COLUMNS`.
@@ -63,9 +55,8 @@ def scores(folder: str) -> tuple[str, int, list[float]]:
     Raises:
         ConfigError: no finished run, or its data is missing or has changed.
     """
-    run = RunFolder.open(folder)
-    settings = settings_of(run)
-    forecaster, data = open_checkpoint(settings, run.checkpoint("best")).eval(), open_data(run, settings, 256)
+    run, settings, forecaster = opened(folder)
+    data = open_data(run, settings, 256)
     found = torch.cat([errors(scene, forecaster.predict(scene)) for scene in split_of(data, "test")])
     return name_of(settings, "test"), len(found), found.mean(0).tolist()
 

@@ -18,17 +18,16 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from benchmarks.along_across import name_of
 from benchmarks.command_line import parser_of
+from benchmarks.runs import name_of, opened
 from epo_lightning import losses
 from epo_lightning.decoders.goals import choose, goal_candidates
 from epo_lightning.experiment import assembly
-from epo_lightning.experiment.opening import open_checkpoint, open_data, settings_of, split_of
+from epo_lightning.experiment.opening import open_data, split_of
 from epo_lightning.forecast import GameParameters
 from epo_lightning.forecasters.epo import EPO
 from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder
 from epo_lightning.scene import Scene
 
 COLUMNS = ("SADE", "initial", "no goals", "true goals", "goal [m]", "entropy", "uniform")
@@ -77,9 +76,8 @@ def scores(folder: str, split: str) -> tuple[str, int, list[float]]:
     Raises:
         ConfigError: no finished run, a row that chooses no goals, or data that is missing or has changed.
     """
-    run = RunFolder.open(folder)
-    settings = settings_of(run)
-    forecaster, data = open_checkpoint(settings, run.checkpoint("best")).eval(), open_data(run, settings, 256)
+    run, settings, forecaster = opened(folder)
+    data = open_data(run, settings, 256)
     if not isinstance(forecaster, EPO) or "goal" not in forecaster.energy.own or data.task.candidates < 2:
         raise ConfigError(
             f"{folder}: {settings.title} does not choose goals: name runs of +EPO rows with a goal feature"

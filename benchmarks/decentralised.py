@@ -19,13 +19,12 @@ import torch
 
 from benchmarks.command_line import parser_of
 from benchmarks.refinement import forecasts
+from benchmarks.runs import opened
 from epo_lightning.experiment import assembly
-from epo_lightning.experiment.opening import open_checkpoint, settings_of
 from epo_lightning.forecast import GameParameters, JointForecast, Solution
 from epo_lightning.forecasters.epo import EPO
 from epo_lightning.game.energy import FEATURES
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder
 from epo_lightning.scene import Scene
 from epo_lightning.solvers.base import Minimiser
 from epo_lightning.solvers.diagnostics.equilibrium import equilibrium
@@ -38,15 +37,13 @@ NEAR = 0.01
 CENTRAL = LevenbergMarquardt(steps=20, step_size=1.0, damping=1.0, adaptive=True, newton_steps=20)
 
 
-def opened(folder: str) -> EPO:
+def with_features(folder: str) -> EPO:
     """The forecaster of a run, which infers games of features.
 
     Raises:
         ConfigError: no finished run, or its forecaster has no such game.
     """
-    run = RunFolder.open(folder)
-    settings = settings_of(run)
-    forecaster = open_checkpoint(settings, run.checkpoint("best")).eval()
+    _, settings, forecaster = opened(folder)
     if not isinstance(forecaster, EPO) or FEATURES not in forecaster.energy.offers:
         raise ConfigError(f"{folder}: {settings.title} infers no game of features; choose a row of forecaster=epo")
     return forecaster
@@ -80,9 +77,9 @@ def report(folder: str, share: float | None, split: str) -> None:
     """Print the rows of one run.
 
     Raises:
-        ConfigError: as :func:`opened`, or its data is missing.
+        ConfigError: as :func:`with_features`, or its data is missing.
     """
-    forecaster = opened(folder)
+    forecaster = with_features(folder)
     settings, given, _, _ = forecasts(folder, share, split)
     games = []
     for scene, _, _ in given:

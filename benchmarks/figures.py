@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 from matplotlib.figure import Figure
@@ -22,15 +21,16 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter
 from torch import Tensor
 
+from benchmarks.runs import opened
 from epo_lightning.data.rpi.scenes import RPIData, RPIDataset
 from epo_lightning.experiment.config.settings import Settings
-from epo_lightning.experiment.opening import open_checkpoint, open_data, settings_of
+from epo_lightning.experiment.opening import open_data
 from epo_lightning.experiment.truth import compare, inferred_costs
+from epo_lightning.forecasters import Forecaster
 from epo_lightning.game.features import PAIR_FEATURES, PairFeature
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.figures import joint_predictions
 from epo_lightning.report.style import MODES, OTHER, save, style
-from epo_lightning.run_folder import RunFolder
 
 LENGTH, WIDTH, MARGIN = 4.5, 1.9, 1.0
 """Size of both vehicles, and the margin of pair features that take one [m]."""
@@ -143,15 +143,14 @@ def _futures(scenes: RPIDataset, record: int) -> tuple[int, int]:
     return executed, alternative
 
 
-def _open(folder: str) -> tuple[Settings, Any, RPIData]:
+def _open(folder: str) -> tuple[Settings, Forecaster, RPIData]:
     """Settings, forecaster and data of a run.
 
     Raises:
-        ConfigError: a run on other data than RPI.
+        ConfigError: no finished run, one on other data than RPI, or its data is missing or has changed.
     """
-    run = RunFolder.open(folder)
-    settings = settings_of(run)
-    forecaster, data = open_checkpoint(settings, run.checkpoint("best")).eval(), open_data(run, settings)
+    run, settings, forecaster = opened(folder)
+    data = open_data(run, settings)
     if not isinstance(data, RPIData):
         raise ConfigError(f"{folder} was trained on other data than RPI, whose weights are not known")
     return settings, forecaster, data

@@ -22,6 +22,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from benchmarks.command_line import parser_of
+from benchmarks.runs import opened
 from epo_lightning.drive.episodes import outside, play
 from epo_lightning.drive.measures import differences, estimate, measure
 from epo_lightning.drive.planners import ForecastPlanner, ResponsePlanner
@@ -31,12 +32,10 @@ from epo_lightning.drive.traffic import TrafficWorld
 from epo_lightning.drive.world import EGO
 from epo_lightning.drive.worlds import place
 from epo_lightning.experiment import assembly
-from epo_lightning.experiment.opening import open_checkpoint, settings_of
 from epo_lightning.forecast import GameParameters
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.game.dynamics import Unicycle
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder
 from epo_lightning.scene import ACCELERATION, HEADING, SPEED, Scene
 
 AHEAD = (2, 4)
@@ -151,17 +150,17 @@ def report(runs: Sequence[str], traffic: str, episodes: int, watched: int, seed:
     """Print both tables.
 
     Raises:
-        ConfigError: a run or a kind of traffic that does not exist, a run of other data, or SUMO is not installed.
+        ConfigError: a run or a kind of traffic that does not exist, a run that is not finished or of other data, or SUMO is
+            not installed.
     """
     where = place("sumo")
     where.check_kinds("sumo", (traffic,))
     forecasters: dict[str, Forecaster | None] = {KEEPING: None}
     for path in runs:
-        run = RunFolder.open(path)
-        settings = settings_of(run)
-        if reason := where.refuse(settings.data):
-            raise ConfigError(f"{path} was trained on data={settings.data['name']}, and world=sumo {reason}")
-        forecasters[settings.title] = open_checkpoint(settings, run.checkpoint("best"))
+        run = opened(path)
+        if reason := where.refuse(run.settings.data):
+            raise ConfigError(f"{path} was trained on data={run.settings.data['name']}, and world=sumo {reason}")
+        forecasters[run.settings.title] = run.forecaster
     with closing(where.make(episodes, seed, traffic)) as world:
         assert isinstance(world, TrafficWorld)
         trained = {

@@ -25,15 +25,14 @@ import torch
 from torch import Tensor
 
 from benchmarks.command_line import parser_of
+from benchmarks.runs import opened
 from epo_lightning import FeatureEnergy, JointForecast, Scene, Solution, refine
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.settings import Settings
-from epo_lightning.experiment.opening import open_checkpoint, settings_of
 from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.refinement import INVERSE_TEMPERATURE, SOLVER, WEIGHTS
 from epo_lightning.refinement.game import NOISE
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder
 
 SCORES = {"minSADE": "SADE", "minSFDE": "SFDE", "minSADE_1": "k=1", "overlap_jfp": "OR"}
 REPEATS = 101
@@ -54,9 +53,7 @@ def forecasts(folder: str, share: float | None, split: str) -> tuple[Settings, F
     Raises:
         ConfigError: no finished run, or its data is missing.
     """
-    run = RunFolder.open(folder)
-    settings = settings_of(run)
-    forecaster = open_checkpoint(settings, run.checkpoint("best")).eval()
+    _, settings, forecaster = opened(folder)
     section = {**settings.data, "batch_size": 256, **({} if share is None else {"share": share})}
     data = assembly.build_data(section)
     data.setup("test" if split == "test" else "validate")

@@ -12,11 +12,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from benchmarks.hidden_weight import TOLD
+from benchmarks.runs import opened
 from epo_lightning.data.rpi.scenes import RPIData
 from epo_lightning.data.rpi.subgames import FUTURE
-from epo_lightning.experiment.opening import open_checkpoint, open_data, settings_of
+from epo_lightning.experiment.opening import open_data
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder
 
 BATCH = 1024
 """Records per batch; it changes no result."""
@@ -65,10 +65,7 @@ def forecasts(folder: str, split: str = "test") -> Forecasts:
     Raises:
         ConfigError: no finished run on RPI, one whose targets are sampled, or its data is missing or has changed.
     """
-    run = RunFolder.open(folder)
-    if not run.finished:
-        raise ConfigError(f"{folder} is not finished: continue it by epo train resume={folder}")
-    settings = settings_of(run)
+    run, settings, forecaster = opened(folder)
     if settings.data["name"] not in ("rpi", TOLD):
         raise ConfigError(f"{folder} was trained on data={settings.data['name']}, but only RPI has known equilibria")
     if settings.data.get("targets") == "sampled":
@@ -76,7 +73,6 @@ def forecasts(folder: str, split: str = "test") -> Forecasts:
             f"{folder} has data.targets=sampled, which keeps one future of every record; "
             "choose a run with data.targets=both or executed"
         )
-    forecaster = open_checkpoint(settings, run.checkpoint("best")).eval()
     data = open_data(run, settings)
     assert isinstance(data, RPIData)
     scenes, records = data.open(split), data.records(split)

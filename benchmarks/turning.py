@@ -18,11 +18,11 @@ from torch import Tensor
 
 from benchmarks.command_line import parser_of
 from benchmarks.goals import TURNING
+from benchmarks.runs import opened
 from epo_lightning.experiment import assembly
-from epo_lightning.experiment.opening import open_checkpoint, open_data, settings_of, split_of
+from epo_lightning.experiment.opening import open_data, split_of
 from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.registry import ConfigError
-from epo_lightning.run_folder import RunFolder
 from epo_lightning.scene import HEADING, Scene
 
 SCORES = {"minADE": "ADE", "minFDE": "FDE", "minSADE": "SADE", "minSFDE": "SFDE"}
@@ -45,9 +45,8 @@ def scores(folder: str) -> tuple[str, dict[str, tuple[int, Mapping[str, float]]]
     Raises:
         ConfigError: no finished run, or its data is missing or has changed.
     """
-    run = RunFolder.open(folder)
-    settings = settings_of(run)
-    forecaster, data = open_checkpoint(settings, run.checkpoint("best")).eval(), open_data(run, settings, 256)
+    run, settings, forecaster = opened(folder)
+    data = open_data(run, settings, 256)
     metrics = {name: ForecastMetrics(shape=data.task.shape) for name in ("turning", "others")}
     counts = dict.fromkeys(metrics, 0)
     for scene in split_of(data, "test"):

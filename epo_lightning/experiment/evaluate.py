@@ -22,7 +22,7 @@ from epo_lightning.experiment import assembly, gpus, logs
 from epo_lightning.experiment.callbacks import style_of
 from epo_lightning.experiment.config.replaced import keys_of
 from epo_lightning.experiment.config.settings import EvaluateSettings, Settings, TrainerSettings
-from epo_lightning.experiment.opening import open_checkpoint, open_data, settings_of, split_of
+from epo_lightning.experiment.opening import open_checkpoint, open_data, refuse_unfinished, settings_of, split_of
 from epo_lightning.experiment.other_data import OtherData, open_other
 from epo_lightning.experiment.provenance import of_other_code
 from epo_lightning.experiment.truth import TruthTest
@@ -130,8 +130,7 @@ def score(
     Raises:
         ConfigError: see :func:`evaluate`.
     """
-    if not run.finished:
-        raise ConfigError(f"{run.path} is not finished: continue it with `epo train resume={run.path}`")
+    refuse_unfinished(run)
     if not pretrained.ships(run.path) and not os.access(run.path, os.W_OK):
         raise ConfigError(
             f"{run.path} cannot be written, and its scores are kept there: score a copy that you may write"

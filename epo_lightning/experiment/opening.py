@@ -39,8 +39,24 @@ def open_checkpoint(settings: Settings, path: Path) -> Any:
     return forecaster
 
 
-def open_data(run: RunFolder, settings: Settings, batch_size: int | None = None) -> Any:
+def refuse_unfinished(run: RunFolder) -> None:
+    """Refuse to score or ship a run whose training has not ended.
+
+    Raises:
+        ConfigError: as said.
+    """
+    if not run.finished:
+        raise ConfigError(f"{run.path} is not finished: continue it with `epo train resume={run.path}`")
+
+
+def open_data(run: RunFolder, settings: Settings, batch_size: int | None = None, share: float | None = None) -> Any:
     """The run's data, which must be what it was trained on.
+
+    Args:
+        run: the run.
+        settings: the run's settings.
+        batch_size: scenes per batch, instead of the run's number.
+        share: share of the scenes of every split, instead of the run's share.
 
     Raises:
         ConfigError: the data is missing or has changed.
@@ -48,6 +64,8 @@ def open_data(run: RunFolder, settings: Settings, batch_size: int | None = None)
     section = dict(settings.data)
     if batch_size is not None and "batch_size" in section:
         section["batch_size"] = batch_size
+    if share is not None:
+        section["share"] = share
     data = assembly.build_data(section)
     with contextlib.suppress(ValueError):  # a command with a quotation mark too few, edited by hand
         data.words = shlex.split(str(run.record.get("command", "")))

@@ -21,14 +21,13 @@ from epo_lightning.experiment.checkpoints import WholeCheckpoints
 from epo_lightning.experiment.config import compose
 from epo_lightning.experiment.config.settings import EvaluateSettings
 from epo_lightning.experiment.evaluate import score
-from epo_lightning.experiment.opening import open_data, settings_of, split_of
+from epo_lightning.experiment.opening import open_data, refuse_unfinished, settings_of, split_of
 from epo_lightning.experiment.pictures import choose
 from epo_lightning.experiment.train import train
 from epo_lightning.experiment.verbs import generate_and_print
 from epo_lightning.files import read_json, write_file, write_json
 from epo_lightning.forecasters import load
 from epo_lightning.metrics import ForecastMetrics
-from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder
 
 SCENES = 16
@@ -73,8 +72,7 @@ def ship(run: RunFolder, name: str, recipe: Recipe, folder: Path) -> Path:
         ConfigError: the run is not finished, or its data is missing or has changed.
     """
     assembly.quiet()
-    if not run.finished:
-        raise ConfigError(f"{run.path} is not finished: continue it with `epo train resume={run.path}`")
+    refuse_unfinished(run)
     with TemporaryDirectory() as place:
         packed = _pack(run, RunFolder(Path(place) / "packed"))
         write_file(packed.path / "card.md", card(name, recipe, packed))

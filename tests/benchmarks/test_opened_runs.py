@@ -1,0 +1,40 @@
+"""Runs that benchmarks open: only finished ones are measured."""
+
+from __future__ import annotations
+
+import pytest
+from programs import refused
+
+from benchmarks import (
+    along_across,
+    chosen_goals,
+    decentralised,
+    distance_by_weight,
+    figures,
+    passing_sides,
+    placements,
+    refinement,
+    shared_errors,
+    turning,
+)
+from epo_lightning.run_folder import RunFolder
+
+OF_RUNS = (
+    along_across,
+    chosen_goals,
+    decentralised,
+    distance_by_weight,
+    passing_sides,
+    placements,
+    refinement,
+    shared_errors,
+    turning,
+)
+"""Benchmarks whose words are run folders."""
+
+
+@pytest.mark.parametrize("words", [(benchmark.main,) for benchmark in OF_RUNS] + [(figures.main, "weights", "w.png")])
+def test_an_unfinished_run_is_refused(words, tmp_path):
+    run = RunFolder(tmp_path / "run")
+    run.begin({"seed": 0}, {})
+    assert f"is not finished: continue it with `epo train resume={run.path}`" in refused(*words, run.path)
