@@ -14,9 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from benchmarks.command_line import parser_of
+from benchmarks.command_line import measuring, parser_of
 from benchmarks.runs import name_of, opened
-from epo_lightning.experiment import assembly
 from epo_lightning.experiment.opening import open_data, split_of
 from epo_lightning.forecast import JointForecast
 from epo_lightning.metrics.functional.displacement import closest_mode
@@ -66,15 +65,11 @@ def main(given: Sequence[str] | None = None) -> None:
     parser = parser_of("along_across", __doc__)
     parser.add_argument("runs", nargs="+", help="folders of finished runs")
     arguments = parser.parse_args(given)
-    torch.set_num_threads(1)
-    assembly.quiet()
-    print(f"{'scenes':>7}" + "".join(f"{name:>8}" for name in COLUMNS) + "  run")
-    try:
+    with measuring(parser):
+        print(f"{'scenes':>7}" + "".join(f"{name:>8}" for name in COLUMNS) + "  run")
         for folder in arguments.runs:
             name, count, found = scores(folder)
             print(f"{count:>7}" + "".join(f"{value:>8.3f}" for value in found) + f"  {name}")
-    except ConfigError as error:
-        raise SystemExit(f"benchmarks.along_across: {error}") from None
 
 
 if __name__ == "__main__":

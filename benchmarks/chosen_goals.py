@@ -18,11 +18,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from benchmarks.command_line import parser_of
+from benchmarks.command_line import measuring, parser_of
 from benchmarks.runs import name_of, opened
 from epo_lightning import losses
 from epo_lightning.decoders.goals import choose, goal_candidates
-from epo_lightning.experiment import assembly
 from epo_lightning.experiment.opening import open_data, split_of
 from epo_lightning.forecast import GameParameters
 from epo_lightning.forecasters.epo import EPO
@@ -121,10 +120,8 @@ def main(given: Sequence[str] | None = None) -> None:
     parser.add_argument("runs", nargs="+", help="folders of finished runs of +EPO rows that choose goals")
     parser.add_argument("--split", choices=("test", "val"), default="test", help="split of the run's data (test)")
     arguments = parser.parse_args(given)
-    torch.set_num_threads(1)
-    assembly.quiet()
-    print(f"{'scenes':>7}" + "".join(f"{name:>12}" for name in COLUMNS) + "  run")
-    try:
+    with measuring(parser):
+        print(f"{'scenes':>7}" + "".join(f"{name:>12}" for name in COLUMNS) + "  run")
         rows = []
         for folder in arguments.runs:
             name, count, found = scores(folder, arguments.split)
@@ -133,8 +130,6 @@ def main(given: Sequence[str] | None = None) -> None:
         if len(rows) > 1:
             means = [statistics.fmean(column) for column in zip(*rows, strict=True)]
             print(f"{'':>7}" + "".join(f"{value:>12.3f}" for value in means) + "  mean of the runs")
-    except ConfigError as error:
-        raise SystemExit(f"benchmarks.chosen_goals: {error}") from None
 
 
 if __name__ == "__main__":

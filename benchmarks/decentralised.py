@@ -17,10 +17,9 @@ from collections.abc import Sequence
 
 import torch
 
-from benchmarks.command_line import parser_of
+from benchmarks.command_line import measuring, parser_of
 from benchmarks.refinement import forecasts
 from benchmarks.runs import opened
-from epo_lightning.experiment import assembly
 from epo_lightning.forecast import GameParameters, JointForecast, Solution
 from epo_lightning.forecasters.epo import EPO
 from epo_lightning.game.energy import FEATURES
@@ -120,13 +119,9 @@ def main(given: Sequence[str] | None = None) -> None:
     parser.add_argument("--share", type=float, help="share of the scenes of the split (default: that of the run)")
     parser.add_argument("--split", choices=("test", "val"), default="test")
     chosen = parser.parse_args(given)
-    torch.set_num_threads(1)
-    assembly.quiet()
-    try:
+    with measuring(parser):
         for folder in chosen.runs:
             report(folder, chosen.share, chosen.split)
-    except ConfigError as error:
-        raise SystemExit(f"benchmarks.decentralised: {error}") from None
 
 
 if __name__ == "__main__":

@@ -18,10 +18,8 @@ from jaxtyping import Float
 from scipy import stats
 from torch import Tensor
 
-from benchmarks.command_line import parser_of
+from benchmarks.command_line import measuring, parser_of
 from benchmarks.rpi_runs import forecasts
-from epo_lightning.experiment import assembly
-from epo_lightning.registry import ConfigError
 
 
 @dataclass(frozen=True)
@@ -75,16 +73,12 @@ def main(given: Sequence[str] | None = None) -> None:
     parser = parser_of("distance_by_weight", __doc__)
     parser.add_argument("runs", nargs="+", help="folders of finished runs on RPI")
     arguments = parser.parse_args(given)
-    torch.set_num_threads(1)
-    assembly.quiet()
-    width = 2 + max(map(len, arguments.runs))
-    print(f"{'run':<{width}}{'futures':<10}{'correlation':>12}{'smallest w':>12}{'largest w':>11}")
-    try:
+    with measuring(parser):
+        width = 2 + max(map(len, arguments.runs))
+        print(f"{'run':<{width}}{'futures':<10}{'correlation':>12}{'smallest w':>12}{'largest w':>11}")
         for folder in arguments.runs:
             for kind, of in measure(folder).items():
                 print(f"{folder:<{width}}{kind:<10}{of.correlation:>12.2f}{of.least:>12.3f}{of.most:>11.3f}")
-    except ConfigError as error:
-        raise SystemExit(f"distance_by_weight: {error}") from None
 
 
 if __name__ == "__main__":

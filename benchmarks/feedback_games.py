@@ -183,7 +183,7 @@ def compare(solver: Feedback, games: Games) -> None:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """The command line."""
-    command_line("feedback_games", __doc__.splitlines()[0], measure, argv)
+    command_line("feedback_games", __doc__, measure, argv)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ solver's steps. A run is a run folder, or the name of a run that ships with the 
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter
 from torch import Tensor
 
+from benchmarks.command_line import measuring, parser_of
 from benchmarks.runs import opened
 from epo_lightning.data.rpi.scenes import RPIData, RPIDataset
 from epo_lightning.experiment.config.settings import Settings
@@ -175,7 +175,7 @@ def _costs(folder: str) -> tuple[str, dict[str, Tensor]]:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = parser_of("figures", __doc__)
     parser.add_argument("figure", choices=("levels", "weights", "modes"))
     parser.add_argument("path", type=Path)
     parser.add_argument("runs", nargs="*")
@@ -185,16 +185,13 @@ def main(argv: Sequence[str] | None = None) -> None:
         parser.error("`weights` and `modes` take run folders, and `levels` takes none")
     if (arguments.figure == "modes") != bool(arguments.records):
         parser.error("`modes` takes --records, and the other figures take none")
-    torch.set_num_threads(1)
-    try:
+    with measuring(parser):
         if arguments.figure == "levels":
             levels(arguments.path)
         elif arguments.figure == "weights":
             weights(arguments.path, arguments.runs)
         else:
             modes(arguments.path, arguments.runs, arguments.records)
-    except ConfigError as error:
-        raise SystemExit(f"figures: {error}") from None
 
 
 if __name__ == "__main__":

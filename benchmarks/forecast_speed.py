@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from benchmarks.command_line import parser_of
+from benchmarks.command_line import measuring, parser_of
 from benchmarks.runs import opened
 from epo_lightning.drive.episodes import outside, play
 from epo_lightning.drive.measures import differences, estimate, measure
@@ -31,7 +31,6 @@ from epo_lightning.drive.road_game import keep_going
 from epo_lightning.drive.traffic import TrafficWorld
 from epo_lightning.drive.world import EGO
 from epo_lightning.drive.worlds import place
-from epo_lightning.experiment import assembly
 from epo_lightning.forecast import GameParameters
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.game.dynamics import Unicycle
@@ -202,12 +201,8 @@ def main(given: Sequence[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--change", type=float, default=0.85, help="acceleration [m/s^2]")
     chosen = parser.parse_args(given)
-    torch.set_num_threads(1)
-    assembly.quiet()
-    try:
+    with measuring(parser):
         report(**vars(chosen))
-    except ConfigError as error:
-        raise SystemExit(f"benchmarks.forecast_speed: {error}") from None
 
 
 if __name__ == "__main__":

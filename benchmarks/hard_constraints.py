@@ -20,10 +20,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from benchmarks.command_line import parser_of
+from benchmarks.command_line import measuring, parser_of
 from benchmarks.many_agents import intentions, largest_scenes, of_agents
 from epo_lightning import FeatureEnergy, GameParameters, LevenbergMarquardt, Scene, Solution
-from epo_lightning.experiment import assembly
 from epo_lightning.forecast import Status
 from epo_lightning.game.neighbours import closest_approach
 from epo_lightning.refinement.game import NOISE, track
@@ -46,7 +45,7 @@ ENERGY = FeatureEnergy(
 )
 SOFT = LevenbergMarquardt(steps=20, step_size=1.0, damping=1.0, adaptive=True, newton_steps=30)
 HARD = AugmentedLagrangian()
-NOTHING = "benchmarks.hard_constraints: there is no scene whose constraints can be met; choose other data"
+NOTHING = "there is no scene whose constraints can be met; choose other data"
 NOTICED = 0.01
 """Violation that counts [m, m/s^2]."""
 
@@ -79,17 +78,21 @@ def solved(minimiser: Minimiser, scene: Scene, parameters: GameParameters) -> tu
 
 
 def report(scene: Scene) -> None:
-    """Print the table of some scenes."""
+    """Print the table of some scenes.
+
+    Raises:
+        ConfigError: there is no scene whose constraints can be met.
+    """
     total = len(scene.history)
     scene = scene[(closest_approach(scene, 0.0) > CLEARANCE).all(1)]
     apart = len(scene.history)
     if not apart:
-        raise SystemExit(NOTHING)
+        raise ConfigError(NOTHING)
     hard, spent = solved(HARD, scene, parameters_of(scene, 1.0))
     kept = (hard.status != Status.STOPPED).all(1)
     print(f"{total} scenes, {total - apart} of which start too close, {apart - int(kept.sum())} without a solution")
     if not kept.any():
-        raise SystemExit(NOTHING)
+        raise ConfigError(NOTHING)
     scene, hard = scene[kept], hard[kept]
     assert hard.constraints is not None
     rounds = hard.constraints.rounds.double()
@@ -114,13 +117,9 @@ def main(given: Sequence[str] | None = None) -> None:
     parser.add_argument("--agents", type=int, default=8, help="largest number of agents")
     parser.add_argument("--scenes", type=int, default=64, help="number of scenes")
     chosen = parser.parse_args(given)
-    torch.set_num_threads(1)
-    assembly.quiet()
-    try:
+    with measuring(parser):
         scenes, _ = largest_scenes(chosen.words, chosen.scenes)
-    except ConfigError as error:
-        raise SystemExit(f"benchmarks.hard_constraints: {error}") from None
-    report(of_agents(scenes, chosen.agents).to(torch.float64))
+        report(of_agents(scenes, chosen.agents).to(torch.float64))
 
 
 if __name__ == "__main__":

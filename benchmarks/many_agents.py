@@ -27,7 +27,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchmarks.command_line import parser_of
+from benchmarks.command_line import measuring, parser_of
 from epo_lightning import FeatureEnergy, JointForecast, LevenbergMarquardt, Scene, refine
 from epo_lightning.decoders.gates import Gate, NearestGate, RadiusGate
 from epo_lightning.decoders.weights import PairWeights
@@ -191,24 +191,20 @@ def main(given: Sequence[str] | None = None) -> None:
     parser.add_argument("--repeats", type=int, default=3, help="repeats of every time, of which the median is printed")
     parser.add_argument("--ahead", type=float, nargs="*", default=[], help="other times [s] of the closest approach")
     chosen = parser.parse_args(given)
-    torch.set_num_threads(1)
-    assembly.quiet()
-    try:
+    with measuring(parser):
         scenes, shape = largest_scenes(chosen.words, chosen.scenes)
-    except ConfigError as error:
-        raise SystemExit(f"benchmarks.many_agents: {error}") from None
-    assert scenes.future is not None
-    for agents in chosen.agents:
-        scene = of_agents(scenes, agents)
-        present = float(scene.agent_mask.sum() / len(scene.agent_mask))
-        print(f"N = {agents}: {len(scene.agent_mask)} scenes, {present:.1f} agents in the mean", flush=True)
-        ahead = scene.dt * scenes.future.shape[2]
-        for number, (name, row) in enumerate(
-            measured(scene, shape, gates(ahead, chosen.ahead), chosen.repeats).items()
-        ):
-            if not number:
-                print(f"{'':<24}" + "".join(f"{column:>10}" for column in row))
-            print(f"{name:<24}" + "".join(f"{value:>10.3g}" for value in row.values()), flush=True)
+        assert scenes.future is not None
+        for agents in chosen.agents:
+            scene = of_agents(scenes, agents)
+            present = float(scene.agent_mask.sum() / len(scene.agent_mask))
+            print(f"N = {agents}: {len(scene.agent_mask)} scenes, {present:.1f} agents in the mean", flush=True)
+            ahead = scene.dt * scenes.future.shape[2]
+            for number, (name, row) in enumerate(
+                measured(scene, shape, gates(ahead, chosen.ahead), chosen.repeats).items()
+            ):
+                if not number:
+                    print(f"{'':<24}" + "".join(f"{column:>10}" for column in row))
+                print(f"{name:<24}" + "".join(f"{value:>10.3g}" for value in row.values()), flush=True)
 
 
 if __name__ == "__main__":

@@ -17,9 +17,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from benchmarks.command_line import parser_of
+from benchmarks.command_line import measuring, parser_of
 from benchmarks.rpi_runs import forecasts
-from epo_lightning.experiment import assembly
 from epo_lightning.registry import ConfigError
 
 
@@ -97,19 +96,15 @@ def main(given: Sequence[str] | None = None) -> None:
     parser = parser_of("passing_sides", __doc__)
     parser.add_argument("runs", nargs="+", help="folders of finished runs on RPI")
     arguments = parser.parse_args(given)
-    torch.set_num_threads(1)
-    assembly.quiet()
-    width = 2 + max(map(len, arguments.runs))
-    print(f"{'run':<{width}}{'side':<6}{'records':>8}{'by one':>8}{'executed':>10}{'alternative':>12}{'other':>7}")
-    try:
+    with measuring(parser):
+        width = 2 + max(map(len, arguments.runs))
+        print(f"{'run':<{width}}{'side':<6}{'records':>8}{'by one':>8}{'executed':>10}{'alternative':>12}{'other':>7}")
         for folder in arguments.runs:
             for side, of in measure(folder).items():
                 print(
                     f"{folder:<{width}}{side:<6}{of.records:>8}{of.by_one:>8.2f}{of.executed:>10.3f}"
                     f"{of.alternative:>12.3f}{of.other:>7.3f}"
                 )
-    except ConfigError as error:
-        raise SystemExit(f"passing_sides: {error}") from None
 
 
 if __name__ == "__main__":

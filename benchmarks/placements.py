@@ -13,14 +13,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
-
-from benchmarks.command_line import parser_of
+from benchmarks.command_line import measuring, parser_of
 from benchmarks.rpi_runs import Forecasts, forecasts
 from epo_lightning.data.cache import SPLITS
 from epo_lightning.data.rpi.scenes import SUBSETS
-from epo_lightning.experiment import assembly
-from epo_lightning.registry import ConfigError
 
 PLACES = ("first", "mirrored", "others")
 
@@ -41,16 +37,12 @@ def main(given: Sequence[str] | None = None) -> None:
     parser.add_argument("runs", nargs="+", help="folders of finished runs on RPI")
     parser.add_argument("--split", choices=SPLITS, default="test", help="which records")
     arguments = parser.parse_args(given)
-    torch.set_num_threads(1)
-    assembly.quiet()
-    width = 2 + max(map(len, arguments.runs))
-    print(f"{'run':<{width}}{'futures':<13}" + "".join(f"{place:>10}" for place in PLACES))
-    try:
+    with measuring(parser):
+        width = 2 + max(map(len, arguments.runs))
+        print(f"{'run':<{width}}{'futures':<13}" + "".join(f"{place:>10}" for place in PLACES))
         for folder in arguments.runs:
             for name, row in errors(forecasts(folder, arguments.split)).items():
                 print(f"{folder:<{width}}{name:<13}" + "".join(f"{value:>10.4f}" for value in row))
-    except ConfigError as error:
-        raise SystemExit(f"placements: {error}") from None
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 import torch
 from torch import Tensor
 
-from benchmarks.command_line import parser_of
+from benchmarks.command_line import measuring, parser_of
 from benchmarks.runs import opened
 from epo_lightning import FeatureEnergy, JointForecast, Scene, Solution, refine
 from epo_lightning.experiment import assembly
@@ -191,17 +191,13 @@ def main(given: Sequence[str] | None = None) -> None:
     parser.add_argument("--noise", type=float, default=NOISE, help="noise of given positions [m]")
     parser.add_argument("--beta", type=float, default=INVERSE_TEMPERATURE, help="inverse temperature")
     chosen = parser.parse_args(given)
-    torch.set_num_threads(1)
-    assembly.quiet()
-    # Every call warns of the futures of marginal forecasters.
-    warnings.filterwarnings("ignore", message="(.* of the given futures of agents|states)")
-    print(f"{'run':<28}{'':<9}{'scenes':<13}" + "".join(f"{label:>9}" for label in SCORES.values()))
-    try:
+    with measuring(parser):
+        # Every call warns of the futures of marginal forecasters.
+        warnings.filterwarnings("ignore", message="(.* of the given futures of agents|states)")
+        print(f"{'run':<28}{'':<9}{'scenes':<13}" + "".join(f"{label:>9}" for label in SCORES.values()))
         weights = WEIGHTS if chosen.weights is None else numbers(chosen.weights)
         for folder in chosen.runs:
             report(folder, weights, numbers(chosen.margins), chosen.noise, chosen.beta, chosen.share, chosen.split)
-    except ConfigError as error:
-        raise SystemExit(f"benchmarks.refinement: {error}") from None
 
 
 if __name__ == "__main__":

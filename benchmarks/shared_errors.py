@@ -21,11 +21,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from benchmarks.command_line import parser_of
+from benchmarks.command_line import measuring, parser_of
 from benchmarks.rpi_runs import forecasts
 from epo_lightning.data.cache import SPLITS
 from epo_lightning.data.rpi.scenes import SUBSETS
-from epo_lightning.experiment import assembly
 from epo_lightning.registry import ConfigError
 
 
@@ -41,25 +40,19 @@ def main(given: Sequence[str] | None = None) -> None:
     parser.add_argument("runs", nargs="+", help="folders of finished runs on the same data of RPI")
     parser.add_argument("--split", choices=SPLITS, default="test", help="which records")
     arguments = parser.parse_args(given)
-    torch.set_num_threads(1)
-    assembly.quiet()
-    try:
+    with measuring(parser):
         found = [forecasts(folder, arguments.split) for folder in arguments.runs]
-    except ConfigError as error:
-        raise SystemExit(f"shared_errors: {error}") from None
-    for folder, of_run in zip(arguments.runs, found, strict=True):
-        if not torch.equal(of_run.futures, found[0].futures):
-            raise SystemExit(
-                f"shared_errors: {folder} has other data than {arguments.runs[0]}: name runs on the same data"
-            )
-    for number, folder in enumerate(arguments.runs):
-        print(f"run {number}: {folder}")
-    for side, name in enumerate(SUBSETS):
-        errors = [of_run.missed(side)[of_run.having(side)] for of_run in found]
-        print(f"{name} futures: rms [m], and correlations with runs 0 to {len(found) - 1}")
-        for number, (error, row) in enumerate(zip(errors, correlations(errors), strict=True)):
-            rms = float(error.double().square().sum(-1).mean().sqrt())
-            print(f"  run {number}: {rms:.4f}  " + " ".join(f"{value:5.2f}" for value in row.tolist()))
+        for folder, of_run in zip(arguments.runs, found, strict=True):
+            if not torch.equal(of_run.futures, found[0].futures):
+                raise ConfigError(f"{folder} has other data than {arguments.runs[0]}: name runs on the same data")
+        for number, folder in enumerate(arguments.runs):
+            print(f"run {number}: {folder}")
+        for side, name in enumerate(SUBSETS):
+            errors = [of_run.missed(side)[of_run.having(side)] for of_run in found]
+            print(f"{name} futures: rms [m], and correlations with runs 0 to {len(found) - 1}")
+            for number, (error, row) in enumerate(zip(errors, correlations(errors), strict=True)):
+                rms = float(error.double().square().sum(-1).mean().sqrt())
+                print(f"  run {number}: {rms:.4f}  " + " ".join(f"{value:5.2f}" for value in row.tolist()))
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ learned: the weights are those with which the generator made the records, and th
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import time
 from collections.abc import Callable, Sequence
@@ -19,6 +18,7 @@ import torch
 from scipy import stats
 from torch import Tensor
 
+from benchmarks.command_line import measuring, parser_of
 from benchmarks.measure import positive
 from epo_lightning.data.rpi.scenes import RPIData
 from epo_lightning.data.rpi.subgames import FUTURE
@@ -139,25 +139,21 @@ def measure(split: str, count: int, overrides: Sequence[str]) -> None:
 
 
 def command_line(
-    name: str, title: str, measure: Callable[[str, int, Sequence[str]], None], argv: Sequence[str] | None
+    name: str, text: str | None, measure: Callable[[str, int, Sequence[str]], None], argv: Sequence[str] | None
 ) -> None:
     """Run a measurement of records, given a split, their number, and overrides of `epo train`."""
-    parser = argparse.ArgumentParser(description=title)
+    parser = parser_of(name, text)
     parser.add_argument("--split", default="test")
     parser.add_argument("--records", type=positive, default=400)
     parser.add_argument("overrides", nargs="*", metavar="override")
     arguments = parser.parse_args(argv)
-    assembly.quiet()
-    torch.set_num_threads(1)
-    try:
+    with measuring(parser):
         measure(arguments.split, arguments.records, arguments.overrides)
-    except ConfigError as error:
-        raise SystemExit(f"{name}: {error}") from None
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """The command line."""
-    command_line("true_game", __doc__.splitlines()[0], measure, argv)
+    command_line("true_game", __doc__, measure, argv)
 
 
 if __name__ == "__main__":

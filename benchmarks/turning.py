@@ -16,10 +16,9 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from benchmarks.command_line import parser_of
+from benchmarks.command_line import measuring, parser_of
 from benchmarks.goals import TURNING
 from benchmarks.runs import opened
-from epo_lightning.experiment import assembly
 from epo_lightning.experiment.opening import open_data, split_of
 from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.registry import ConfigError
@@ -65,16 +64,12 @@ def main(given: Sequence[str] | None = None) -> None:
     parser = parser_of("turning", __doc__)
     parser.add_argument("runs", nargs="+", help="folders of finished runs on recorded data")
     arguments = parser.parse_args(given)
-    torch.set_num_threads(1)
-    assembly.quiet()
-    print(f"{'run':<36}{'agents':<9}{'number':>7}" + "".join(f"{label:>8}" for label in SCORES.values()))
-    try:
+    with measuring(parser):
+        print(f"{'run':<36}{'agents':<9}{'number':>7}" + "".join(f"{label:>8}" for label in SCORES.values()))
         for folder in arguments.runs:
             title, found = scores(folder)
             for name, (count, values) in found.items():
                 print(f"{title:<36}{name:<9}{count:>7}" + "".join(f"{values[metric]:>8.3f}" for metric in SCORES))
-    except ConfigError as error:
-        raise SystemExit(f"benchmarks.turning: {error}") from None
 
 
 if __name__ == "__main__":

@@ -37,4 +37,5 @@ OF_RUNS = (
 def test_an_unfinished_run_is_refused(words, tmp_path):
     run = RunFolder(tmp_path / "run")
     run.begin({"seed": 0}, {})
-    assert f"is not finished: continue it with `epo train resume={run.path}`" in refused(*words, run.path)
+    advice = f"{run.path} is not finished: continue it with `epo train resume={run.path}`"
+    assert refused(*words, run.path) == f"{words[0].__module__}: {advice}"

@@ -11,6 +11,7 @@ from programs import TINY, refused
 from benchmarks import decentralised, forecast_speed, hard_constraints, many_agents, refinement
 from epo_lightning.experiment import train
 from epo_lightning.experiment.config.compose import compose
+from epo_lightning.registry import ConfigError
 from epo_lightning.scene import Scene
 
 
@@ -73,5 +74,5 @@ def test_hard_constraints_are_kept_and_soft_ones_are_not(capsys):
     rows = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert [row[0] for row in rows[-5:]] == ["soft,"] * 4 + ["hard"]
     assert float(rows[-5][3]) > 0.01 > 0.001 >= float(rows[-1][2])
-    with pytest.raises(SystemExit, match="no scene whose constraints can be met"):
+    with pytest.raises(ConfigError, match="no scene whose constraints can be met"):
         hard_constraints.report(dataclasses.replace(scene, size=8 * size))
