@@ -7,7 +7,6 @@ W&B is offline, so no network is needed. The data set is small: `epo generate da
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import resource
@@ -22,6 +21,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.command_line import parser_of
 from benchmarks.measure import positive
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.compose import compose
@@ -77,7 +77,7 @@ def measure(logger: str, row: str, data: Sequence[str], epochs: int) -> Spent:
 
 def main(given: Sequence[str] | None = None) -> None:
     """Measure in turns; print medians and the increase over the first logger."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.dashboards", description=__doc__)
+    parser = parser_of("dashboards", __doc__)
     parser.add_argument("--row", default="rpi/v_lstm_epo", help="the experiment")
     parser.add_argument("--data", nargs="+", default=list(DATA), help="overrides that choose the data set")
     parser.add_argument(

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks import devices, measure, scaling
+from benchmarks.command_line import parser_of
 from benchmarks.comparison import Measurement, measurements
 from benchmarks.games import LANE_POINTS, SETTINGS, Game, activity, make
 from benchmarks.implementations import NAMES, Missing, prepare
@@ -90,7 +91,7 @@ def append(path: Path, found: Sequence[Measurement]) -> None:
 
 
 def _arguments(given: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.epo_layer", description=__doc__)
+    parser = parser_of("epo_layer", __doc__)
     parser.add_argument("--settings", nargs="+", default=["exid", "rpi"], choices=SETTINGS)
     parser.add_argument("--implementations", nargs="+", default=list(NAMES), choices=NAMES)
     parser.add_argument("--repeats", type=measure.positive, default=7, help="rounds; the median counts")

@@ -10,7 +10,6 @@ playwright and Chromium.
 
 from __future__ import annotations
 
-import argparse
 import io
 import random
 import shutil
@@ -21,6 +20,7 @@ from typing import Any
 import torch
 from PIL import Image
 
+from benchmarks.command_line import parser_of
 from benchmarks.measure import positive
 from epo_lightning.experiment.config.compose import compose
 from epo_lightning.experiment.config.settings import ExploreSettings
@@ -123,7 +123,7 @@ def _scenario(page: Any) -> Iterator[bytes]:
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of("explore", __doc__)
     verbs = parser.add_subparsers(dest="verb", required=True)
     timed = verbs.add_parser("times")
     timed.add_argument("run")

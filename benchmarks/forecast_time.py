@@ -6,13 +6,13 @@ CPU times of one thread, over rounds in which the forecasters take turns.
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import time
 from collections.abc import Sequence
 
 import torch
 
+from benchmarks.command_line import parser_of
 from benchmarks.measure import positive
 from epo_lightning import load, pretrained
 from epo_lightning.forecasters import Forecaster
@@ -28,7 +28,7 @@ def milliseconds(forecaster: Forecaster, scenes: Scene) -> float:
 
 def main(given: Sequence[str] | None = None) -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.forecast_time", description=__doc__)
+    parser = parser_of("forecast_time", __doc__)
     parser.add_argument("names", nargs="*", metavar="NAME", help="shipped forecasters; all of them by default")
     parser.add_argument("--rounds", type=positive, default=3, help="rounds over all example scenes")
     arguments = parser.parse_args(given)

@@ -11,12 +11,12 @@ have no distance; such alternatives are counted.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from benchmarks.command_line import parser_of
 from benchmarks.measure import positive
 from epo_lightning.data.rpi.game import Array, GameConstants, generator, main_game
 from epo_lightning.data.rpi.kernels import passage
@@ -91,7 +91,7 @@ def _distance(one: Array, other: Array) -> float:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of("label_noise", __doc__)
     parser.add_argument("--games", type=positive, default=40, help="number of main games")
     parser.add_argument("--seed", type=int, default=0, help="seed of the games")
     given = parser.parse_args(arguments)

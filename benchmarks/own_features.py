@@ -9,7 +9,6 @@ one thread, medians over rounds in which the energies take turns.
 
 from __future__ import annotations
 
-import argparse
 import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -17,6 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from benchmarks.command_line import parser_of
 from benchmarks.measure import interleaved, positive
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.compose import compose
@@ -85,7 +85,7 @@ def step(row: str, added: tuple[str, Source] | None) -> Callable[[], Any]:
 
 def main(given: Sequence[str] | None = None) -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.own_features", description=__doc__)
+    parser = parser_of("own_features", __doc__)
     parser.add_argument("--rounds", type=positive, default=9, help="rounds, of which medians are taken")
     parser.add_argument("--rows", nargs="+", default=ROWS, help="experiments whose energies get the features")
     arguments = parser.parse_args(given)

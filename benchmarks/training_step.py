@@ -7,7 +7,6 @@ It measures the forecasters of the paper's RPI experiments, or those of other ro
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import statistics
 import time
@@ -20,6 +19,7 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor, nn
 
+from benchmarks.command_line import parser_of
 from benchmarks.devices import device_name, require
 from benchmarks.measure import positive
 from epo_lightning.experiment import assembly, step_graph
@@ -300,7 +300,7 @@ def whole_steps(
 
 def main(given: Sequence[str] | None = None) -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.training_step", description=__doc__)
+    parser = parser_of("training_step", __doc__)
     parser.add_argument("overrides", nargs="*", help="as for `epo train`")
     parser.add_argument(
         "--rows", default=",".join(EXPERIMENTS), help="experiments of conf/experiment/rpi, separated by commas"
