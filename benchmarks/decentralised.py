@@ -18,12 +18,14 @@ from collections.abc import Sequence
 import torch
 
 from benchmarks.command_line import measuring, parser_of
-from benchmarks.refinement import forecasts
 from benchmarks.runs import opened
+from epo_lightning.experiment.config.settings import Settings
+from epo_lightning.experiment.opening import open_data, split_of
 from epo_lightning.forecast import GameParameters, JointForecast, Solution
 from epo_lightning.forecasters.epo import EPO
 from epo_lightning.game.energy import FEATURES
 from epo_lightning.registry import ConfigError
+from epo_lightning.run_folder import RunFolder
 from epo_lightning.scene import Scene
 from epo_lightning.solvers.base import Minimiser
 from epo_lightning.solvers.diagnostics.equilibrium import equilibrium
@@ -36,16 +38,16 @@ NEAR = 0.01
 CENTRAL = LevenbergMarquardt(steps=20, step_size=1.0, damping=1.0, adaptive=True, newton_steps=20)
 
 
-def with_features(folder: str) -> EPO:
-    """The forecaster of a run, which infers games of features.
+def with_features(folder: str) -> tuple[RunFolder, Settings, EPO]:
+    """A run whose forecaster infers games of features.
 
     Raises:
         ConfigError: no finished run, or its forecaster has no such game.
     """
-    _, settings, forecaster = opened(folder)
+    run, settings, forecaster = opened(folder)
     if not isinstance(forecaster, EPO) or FEATURES not in forecaster.energy.offers:
         raise ConfigError(f"{folder}: {settings.title} infers no game of features; choose a row of forecaster=epo")
-    return forecaster
+    return run, settings, forecaster
 
 
 def solved(
@@ -76,12 +78,12 @@ def report(folder: str, share: float | None, split: str) -> None:
     """Print the rows of one run.
 
     Raises:
-        ConfigError: as :func:`with_features`, or its data is missing.
+        ConfigError: as :func:`with_features`, or its data is missing or has changed.
     """
-    forecaster = with_features(folder)
-    settings, given, _, _ = forecasts(folder, share, split)
+    run, settings, forecaster = with_features(folder)
+    data = open_data(run, settings, 256, share)
     games = []
-    for scene, _, _ in given:
+    for scene in split_of(data, split):
         parameters = forecaster(scene).parameters
         assert parameters is not None
         games.append((scene.to(torch.float64), dataclasses.replace(parameters.to(torch.float64), context=None)))

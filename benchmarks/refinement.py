@@ -27,8 +27,8 @@ from torch import Tensor
 from benchmarks.command_line import measuring, parser_of
 from benchmarks.runs import opened
 from epo_lightning import FeatureEnergy, JointForecast, Scene, Solution, refine
-from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.settings import Settings
+from epo_lightning.experiment.opening import open_data, split_of
 from epo_lightning.metrics import ForecastMetrics
 from epo_lightning.refinement import INVERSE_TEMPERATURE, SOLVER, WEIGHTS
 from epo_lightning.refinement.game import NOISE
@@ -51,15 +51,12 @@ def forecasts(folder: str, share: float | None, split: str) -> tuple[Settings, F
     """Settings of a run; scenes, futures and probabilities in batches of 256; names of the subsets, and shape of agents.
 
     Raises:
-        ConfigError: no finished run, or its data is missing.
+        ConfigError: no finished run, or its data is missing or has changed.
     """
-    _, settings, forecaster = opened(folder)
-    section = {**settings.data, "batch_size": 256, **({} if share is None else {"share": share})}
-    data = assembly.build_data(section)
-    data.setup("test" if split == "test" else "validate")
-    loader = data.test_dataloader() if split == "test" else data.val_dataloader()
+    run, settings, forecaster = opened(folder)
+    data = open_data(run, settings, 256, share)
     found = []
-    for scene in loader:
+    for scene in split_of(data, split):
         forecast = forecaster(scene)
         found.append((scene, forecast.states, forecast.probabilities))
     return settings, found, data.task.subsets, data.task.shape

@@ -1,9 +1,9 @@
-"""Runs that benchmarks open: only finished ones are measured."""
+"""Runs that benchmarks open: only finished ones are measured, on the data that they were trained on."""
 
 from __future__ import annotations
 
 import pytest
-from programs import refused
+from programs import TINY, refused
 
 from benchmarks import (
     along_across,
@@ -17,6 +17,9 @@ from benchmarks import (
     shared_errors,
     turning,
 )
+from epo_lightning.data import drawn
+from epo_lightning.experiment import train
+from epo_lightning.experiment.config.compose import compose
 from epo_lightning.run_folder import RunFolder
 
 OF_RUNS = (
@@ -39,3 +42,10 @@ def test_an_unfinished_run_is_refused(words, tmp_path):
     run.begin({"seed": 0}, {})
     advice = f"{run.path} is not finished: continue it with `epo train resume={run.path}`"
     assert refused(*words, run.path) == f"{words[0].__module__}: {advice}"
+
+
+def test_data_that_has_changed_is_refused(tmp_path, monkeypatch):
+    run = train.train(compose("train", ["experiment=highway/v_lstm_epo_equilibrium", *TINY, f"runs={tmp_path}"]))
+    monkeypatch.setattr(drawn, "VERSION", drawn.VERSION + 1)
+    for main in (refinement.main, decentralised.main):
+        assert f"the data of {run.path} has changed since the run began" in refused(main, run.path)

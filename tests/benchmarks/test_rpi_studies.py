@@ -20,6 +20,7 @@ from benchmarks import (
     label_noise,
     passing_sides,
     placements,
+    refinement,
     shared_errors,
     true_game,
 )
@@ -159,6 +160,9 @@ def test_sides_that_a_run_serves_are_counted(capsys, tmp_path):
     lines = capsys.readouterr().out.splitlines()
     assert lines[:2] == [f"run 0: {run}", f"run 1: {run}"]
     assert [line.split()[3:] for line in lines if line.startswith("  run")] == 4 * [["1.00", "1.00"]]
+    scenes = [refinement.forecasts(str(run), share, "test")[1] for share in (None, 0.5)]
+    both, half = (sum(len(scene.history) for scene, *_ in of_share) for of_share in scenes)
+    assert half == round(both / 2)
     assert "no run folder" in refused(passing_sides.main, tmp_path / "nowhere")
     record = run / "run.json"
     record.write_text(record.read_text().replace('"finished"', '"training"'))
