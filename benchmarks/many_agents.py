@@ -36,6 +36,7 @@ from epo_lightning.experiment.config.compose import compose
 from epo_lightning.game.neighbours import group_sizes
 from epo_lightning.game.pairs import pair_mask
 from epo_lightning.metrics import ForecastMetrics
+from epo_lightning.metrics.functional.interaction import straight_on
 from epo_lightning.refinement import SOLVER
 from epo_lightning.registry import ConfigError
 
@@ -105,9 +106,7 @@ def intentions(scene: Scene) -> Tensor:
     assert scene.future is not None
     current = torch.where(scene.agent_mask[..., None], scene.current, 0.0)
     time_ahead = scene.dt * torch.arange(1, scene.future.shape[2] + 1)
-    velocity = current[..., 3:] * torch.stack((current[..., 2].cos(), current[..., 2].sin()), -1)
-    position = current[:, :, None, :2] + time_ahead[:, None] * velocity[:, :, None]
-    return torch.cat((position, current[:, :, None, 2:].expand(-1, -1, len(time_ahead), -1)), -1)[:, None]
+    return straight_on(current, time_ahead)[:, None]
 
 
 def milliseconds(action: Callable[[], object], scenes: int, repeats: int) -> float:
