@@ -21,6 +21,7 @@ from matplotlib.ticker import FuncFormatter
 from torch import Tensor
 
 from benchmarks.command_line import measuring, parser_of
+from benchmarks.rpi_runs import drawn
 from benchmarks.runs import opened
 from epo_lightning.data.rpi.scenes import RPIData, RPIDataset
 from epo_lightning.experiment.config.settings import Settings
@@ -161,9 +162,7 @@ def _costs(folder: str) -> tuple[str, dict[str, Tensor]]:
     """Title of a run, and true and inferred costs of random records of its test split."""
     settings, forecaster, data = _open(folder)
     scenes = data.open("test")
-    executed = (scenes.mode == 0).nonzero().flatten()
-    chosen = executed[torch.randperm(len(executed), generator=torch.Generator().manual_seed(0))[:RECORDS]]
-    scene = scenes[chosen]
+    scene = scenes[drawn(scenes, RECORDS)]
     assert scene.id is not None
     forecast = forecaster.predict(scene)
     if forecast.parameters is None or not forecast.parameters.pair_weights:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from benchmarks.hidden_weight import TOLD
 from benchmarks.runs import opened
-from epo_lightning.data.rpi.scenes import RPIData
+from epo_lightning.data.rpi.scenes import RPIData, RPIDataset
 from epo_lightning.data.rpi.subgames import FUTURE
 from epo_lightning.experiment.opening import open_data
 from epo_lightning.registry import ConfigError
@@ -58,6 +58,12 @@ class Forecasts:
         return self.both if side else torch.ones_like(self.both)
 
 
+def drawn(scenes: RPIDataset, count: int) -> Int[Tensor, " rows"]:
+    """Rows of random records with their executed futures, in the same order on every machine; fewer if there are fewer."""
+    executed = scenes.executed
+    return executed[torch.randperm(len(executed), generator=torch.Generator().manual_seed(0))[:count]]
+
+
 @torch.no_grad()
 def forecasts(folder: str, split: str = "test") -> Forecasts:
     """The forecasts of a finished run for a split of its data.
@@ -76,7 +82,7 @@ def forecasts(folder: str, split: str = "test") -> Forecasts:
     data = open_data(run, settings)
     assert isinstance(data, RPIData)
     scenes, records = data.open(split), data.records(split)
-    scene = scenes[(scenes.mode == 0).nonzero().flatten()]  # type: ignore[attr-defined]
+    scene = scenes[scenes.executed]
     chunks = torch.arange(len(scene.history)).split(BATCH)
     return Forecasts(
         modes=torch.cat([forecaster.predict(scene[chunk]).states[..., :2] for chunk in chunks]),

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from benchmarks.command_line import measuring, parser_of
 from benchmarks.measure import positive
+from benchmarks.rpi_runs import drawn
 from epo_lightning.data.rpi.scenes import RPIData
 from epo_lightning.data.rpi.subgames import FUTURE
 from epo_lightning.drive.rpi import true_game
@@ -67,11 +68,10 @@ class TrueGames:
             ConfigError: the split has fewer records.
         """
         scenes, records = data.open(split), data.records(split)
-        executed = (scenes.mode == 0).nonzero().flatten()
-        if len(executed) < count:
-            raise ConfigError(f"the {split} split of {data.folder} has {len(executed)} records, fewer than {count}")
-        order = torch.randperm(len(executed), generator=torch.Generator().manual_seed(0))
-        scene = scenes[executed[order[:count]].sort().values].to(torch.double)
+        chosen = drawn(scenes, count)
+        if len(chosen) < count:
+            raise ConfigError(f"the {split} split of {data.folder} has {len(chosen)} records, fewer than {count}")
+        scene = scenes[chosen.sort().values].to(torch.double)
         rows = {name: values[scene.id] for name, values in records.items()}
         return cls(scene, rows["weight"].double(), rows["states"].double(), rows["modes"] == 2)
 

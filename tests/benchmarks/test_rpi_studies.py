@@ -24,8 +24,8 @@ from benchmarks import (
     shared_errors,
     true_game,
 )
-from benchmarks.rpi_runs import Forecasts
-from epo_lightning.data.rpi.scenes import RPIData
+from benchmarks.rpi_runs import Forecasts, drawn
+from epo_lightning.data.rpi.scenes import RPIData, RPIDataset
 from epo_lightning.experiment import train
 from epo_lightning.experiment.config.compose import compose
 
@@ -76,6 +76,17 @@ def test_the_noise_of_recorded_futures_is_measured(capsys):
     assert list(means) == ["potential", "feedback", "feedback_converged"]
     assert max(means["potential"]) < 1e-4
     assert max(means["feedback_converged"]) < 0.01 < min(means["feedback"])
+
+
+def test_records_are_drawn_with_their_executed_futures():
+    modes = torch.tensor([2, 1, 2, 2, 1])
+    records = {"history": torch.zeros(5, 2, 19, 4), "goals": torch.zeros(5, 2, 2), "goal_headings": torch.zeros(5, 2)}
+    records |= {"states": torch.zeros(5, 2, 2, 40, 4), "game_steps": torch.full((5,), 40), "modes": modes}
+    scenes = RPIDataset(records)
+    assert scenes.executed.tolist() == [0, 2, 3, 5, 7]
+    few, every = drawn(scenes, 3), drawn(scenes, 9)
+    assert sorted(every.tolist()) == [0, 2, 3, 5, 7]
+    assert few.tolist() == every[:3].tolist()
 
 
 def test_a_side_is_taught_if_another_mode_is_closest_to_it():

@@ -63,6 +63,11 @@ class RPIDataset:
     def __len__(self) -> int:
         return len(self.record)
 
+    @property
+    def executed(self) -> Integer[Tensor, " rows"]:
+        """Rows of the scenes with executed futures: one of every record, unless targets are sampled."""
+        return (self.mode == 0).nonzero().flatten()
+
     def __getitem__(self, indices: Tensor) -> Scene:
         record, mode = self.record[indices], self.mode[indices]
         history = self.history[record]
