@@ -24,27 +24,15 @@ from benchmarks.command_line import parser_of
 from benchmarks.measure import positive
 from epo_lightning.experiment.config.compose import compose
 from epo_lightning.experiment.config.settings import ExploreSettings
-from epo_lightning.experiment.opening import open_checkpoint, settings_of
-from epo_lightning.experiment.predict import scenes_of
+from epo_lightning.experiment.explore import open_session
 from epo_lightning.explore.edit import Edit
 from epo_lightning.explore.session import Session
-from epo_lightning.run_folder import RunFolder
 from epo_lightning.schema import read
 
 WIDTH, HEIGHT = 1180, 760
 """Size of the browser's window in pixels."""
 SHOWN = 0.7
 """Size of the film's frames relative to the window."""
-
-
-def open_session(words: Sequence[str]) -> Session:
-    """The games of a run, from the overrides of ``epo explore``."""
-    settings = read(ExploreSettings, compose("explore", words))
-    run = RunFolder.open(settings.run)
-    of_run = settings_of(run)
-    forecaster = open_checkpoint(of_run, run.checkpoint(settings.checkpoint))
-    chosen = scenes_of(run, of_run, settings, forecaster, words)
-    return Session(forecaster, chosen.scenes, of_run.title)
 
 
 def random_edit(session: Session, draw: random.Random) -> Edit:
@@ -57,8 +45,8 @@ def random_edit(session: Session, draw: random.Random) -> Edit:
 
 
 def times(words: Sequence[str], count: int) -> dict[str, list[float]]:
-    """Milliseconds of solver and whole answer for random edits."""
-    session, draw = open_session(words), random.Random(0)
+    """Milliseconds of solver and whole answer for random edits of a run's games, from the overrides of ``epo explore``."""
+    session, draw = open_session(read(ExploreSettings, compose("explore", words)), words), random.Random(0)
     found: dict[str, list[float]] = {"solver": [], "all": []}
     for _ in range(count):
         answer = session.solve(random_edit(session, draw))

@@ -17,6 +17,23 @@ HOST = "127.0.0.1"
 """Address of the page: it cannot be reached from other machines."""
 
 
+def open_session(settings: ExploreSettings, overrides: Sequence[str]) -> Session:
+    """The games of a run, with the scenes that the settings choose.
+
+    Args:
+        settings: the run and the scenes.
+        overrides: the user's overrides; settings of other data that they name do not follow the run.
+
+    Raises:
+        ConfigError: no run, checkpoint or data; or a run without a game.
+    """
+    run = RunFolder.open(settings.run)
+    of_run = settings_of(run)
+    forecaster = open_checkpoint(of_run, run.checkpoint(settings.checkpoint))
+    chosen = scenes_of(run, of_run, settings, forecaster, overrides)
+    return Session(forecaster, chosen.scenes, of_run.title, tuple(chosen.about["subsets"]))
+
+
 def explore(settings: ExploreSettings, overrides: Sequence[str], tell: Callable[[str], None]) -> None:
     """Serve the page until it is interrupted.
 
@@ -37,11 +54,7 @@ def explore(settings: ExploreSettings, overrides: Sequence[str], tell: Callable[
             f"epo explore needs the package {error.name}: pip install 'epo_lightning[explore]'"
         ) from error
     assembly.quiet()
-    run = RunFolder.open(settings.run)
-    of_run = settings_of(run)
-    forecaster = open_checkpoint(of_run, run.checkpoint(settings.checkpoint))
-    chosen = scenes_of(run, of_run, settings, forecaster, overrides)
-    session = Session(forecaster, chosen.scenes, of_run.title, tuple(chosen.about["subsets"]))
+    session = open_session(settings, overrides)
     with socket.socket() as bound:
         bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
