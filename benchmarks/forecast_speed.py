@@ -66,7 +66,8 @@ class Accelerated(ResponsePlanner):
         return controls
 
 
-Forecasts = Mapping[str, Float[np.ndarray, "n K 2"]]
+Forecasts = Mapping[str, Float[np.ndarray, "N K 2"]]
+"""Forecast positions [m] in one episode, by forecast."""
 
 
 def watch(
@@ -112,8 +113,10 @@ def watch(
     return {name: {ahead: np.array(values) for ahead, values in found.items()} for name, found in errors.items()}
 
 
-def _positions(world: TrafficWorld, scene: Scene, forecasters: Mapping[str, ForecastPlanner]) -> Forecasts:
-    """Forecast positions [B, N, K, 2] in the world's frame, by forecast."""
+def _positions(
+    world: TrafficWorld, scene: Scene, forecasters: Mapping[str, ForecastPlanner]
+) -> Mapping[str, Float[np.ndarray, "B N K 2"]]:
+    """Forecast positions [m] in the world's frame, by forecast."""
     steps = max(AHEAD) * round(1 / world.dt)
     controls = {name: forecaster.controls_of_all(scene).double() for name, forecaster in forecasters.items()}
     controls[KEEPING] = keep_going(scene, steps)[:, : world.agents]
