@@ -12,12 +12,12 @@ sent per scene, and CPU time per scene of all agents together. Nothing is writte
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Sequence
 
 import torch
 
 from benchmarks.command_line import measuring, parser_of
+from benchmarks.measure import cpu_milliseconds
 from benchmarks.runs import opened
 from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.experiment.opening import open_data, split_of
@@ -55,10 +55,8 @@ def solved(
 ) -> tuple[list[Solution], float]:
     """The solutions of all games, and the CPU time per scene in milliseconds."""
     forecaster.solver = minimiser
-    before = time.process_time()
-    found = [forecaster.solve(scene, parameters) for scene, parameters in games]
-    spent = time.process_time() - before
-    return found, 1e3 * spent / sum(len(scene.history) for scene, _ in games)
+    scenes = sum(len(scene.history) for scene, _ in games)
+    return cpu_milliseconds(lambda: [forecaster.solve(scene, parameters) for scene, parameters in games], scenes)
 
 
 def gaps(forecaster: EPO, games: Sequence[tuple[Scene, GameParameters]], found: Sequence[Solution]) -> torch.Tensor:

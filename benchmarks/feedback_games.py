@@ -13,7 +13,6 @@ compiled kernel, in PyTorch, and by the generator of RPI (compiled by Numba, one
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.measure import cpu_milliseconds
 from benchmarks.true_game import TrueGames, command_line, parts
 from epo_lightning.data.rpi import solve as generator
 from epo_lightning.data.rpi.game import GameConstants
@@ -90,10 +90,9 @@ def quantiles(values: Tensor) -> str:
 @torch.no_grad()
 def solve(title: str, solver: Feedback, games: Games, exact: Solution | None = None) -> Solution:
     """Solve all games and print a line. LQ games are counted in PyTorch."""
-    start = time.process_time()
+    scene = games.records.scene
     with counted() as numbers:
-        found = solver(games.energy, games.records.scene, games.parameters)
-    spent = 1e3 * (time.process_time() - start) / len(found.status)
+        found, spent = cpu_milliseconds(lambda: solver(games.energy, scene, games.parameters), len(scene.history))
     solved = found.status == Status.COMPLETED
     line = f"{title:28} solved {int(solved.sum())} of {solved.numel()}"
     if numbers:
@@ -131,11 +130,9 @@ def race(solver: Feedback, games: Games) -> None:
     game = FeedbackGame(games.energy, scene, one, solver.regularisation)
 
     def line(title: str, run: Callable[[], Tensor]) -> float:
-        run()  # compiles, and fills caches
-        before = time.process_time()
-        solved = run()
-        spent = 1e3 * (time.process_time() - before) / len(solved)
-        print(f"{title:28} solved {int(solved.sum())} of {len(solved)}  {spent:7.3f} ms of CPU per game")
+        count = len(run())  # compiles, and fills caches
+        solved, spent = cpu_milliseconds(run, count)
+        print(f"{title:28} solved {int(solved.sum())} of {count}  {spent:7.3f} ms of CPU per game")
         return spent
 
     def ours(iterate: Callable[..., tuple[Tensor, Tensor]]) -> Tensor:

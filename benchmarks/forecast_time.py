@@ -7,23 +7,20 @@ CPU times of one thread, over rounds in which the forecasters take turns.
 from __future__ import annotations
 
 import statistics
-import time
 from collections.abc import Sequence
 
 import torch
 
 from benchmarks.command_line import parser_of
-from benchmarks.measure import positive
+from benchmarks.measure import cpu_milliseconds, positive
 from epo_lightning import load, pretrained
 from epo_lightning.forecasters import Forecaster
 from epo_lightning.scene import Scene
 
 
 def milliseconds(forecaster: Forecaster, scenes: Scene) -> float:
-    """CPU time of a forecast of some scenes."""
-    start = time.process_time()
-    forecaster.predict(scenes)
-    return 1e3 * (time.process_time() - start)
+    """CPU time per scene of a forecast of some scenes."""
+    return cpu_milliseconds(lambda: forecaster.predict(scenes), len(scenes.history))[1]
 
 
 def main(given: Sequence[str] | None = None) -> None:
@@ -44,7 +41,7 @@ def main(given: Sequence[str] | None = None) -> None:
         for name, forecaster, scenes in ready:
             count = len(scenes.history)
             one_by_one = [milliseconds(forecaster, scenes[torch.tensor([row])]) for row in range(count)]
-            at_once = milliseconds(forecaster, scenes) / count
+            at_once = milliseconds(forecaster, scenes)
             if round_ > 0:  # the first round fills caches
                 single[name] += one_by_one
                 together[name].append(at_once)

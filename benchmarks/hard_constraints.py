@@ -14,7 +14,6 @@ meets the constraints was found, are counted and left out. Nothing is written.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 
 import torch
@@ -22,6 +21,7 @@ from torch import Tensor
 
 from benchmarks.command_line import measuring, parser_of
 from benchmarks.many_agents import intentions, largest_scenes, of_agents
+from benchmarks.measure import cpu_milliseconds
 from epo_lightning import FeatureEnergy, GameParameters, LevenbergMarquardt, Scene, Solution
 from epo_lightning.forecast import Status
 from epo_lightning.game.neighbours import closest_approach
@@ -72,9 +72,7 @@ def violation(scene: Scene, parameters: GameParameters, controls: Tensor) -> Ten
 @torch.no_grad()
 def solved(minimiser: Minimiser, scene: Scene, parameters: GameParameters) -> tuple[Solution, float]:
     """The solution, and the CPU time per scene [ms]."""
-    before = time.process_time()
-    found = minimiser(ENERGY, scene, parameters)
-    return found, 1e3 * (time.process_time() - before) / len(scene.history)
+    return cpu_milliseconds(lambda: minimiser(ENERGY, scene, parameters), len(scene.history))
 
 
 def report(scene: Scene) -> None:

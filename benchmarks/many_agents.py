@@ -19,7 +19,6 @@ overlap [%]. Nothing is written.
 from __future__ import annotations
 
 import statistics
-import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
@@ -28,6 +27,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.command_line import measuring, parser_of
+from benchmarks.measure import cpu_milliseconds
 from epo_lightning import FeatureEnergy, JointForecast, LevenbergMarquardt, Scene, refine
 from epo_lightning.decoders.gates import Gate, NearestGate, RadiusGate
 from epo_lightning.decoders.weights import PairWeights
@@ -111,12 +111,8 @@ def intentions(scene: Scene) -> Tensor:
 
 def milliseconds(action: Callable[[], object], scenes: int, repeats: int) -> float:
     """Median CPU time per scene of an action on a batch."""
-    times = []
-    for _ in range(repeats + 1):
-        before = time.process_time()
-        action()
-        times.append(time.process_time() - before)
-    return 1e3 * statistics.median(times[1:]) / scenes
+    times = [cpu_milliseconds(action, scenes)[1] for _ in range(repeats + 1)]
+    return statistics.median(times[1:])
 
 
 def measured(scene: Scene, shape: str, chosen: dict[str, Gate | None], repeats: int) -> dict[str, Row]:

@@ -17,7 +17,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import statistics
-import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
@@ -25,6 +24,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.command_line import measuring, parser_of
+from benchmarks.measure import cpu_milliseconds
 from benchmarks.runs import opened
 from epo_lightning import FeatureEnergy, JointForecast, Scene, Solution, refine
 from epo_lightning.experiment.config.settings import Settings
@@ -99,10 +99,8 @@ def milliseconds(given: Forecasts, size: int, refinement: Refinement) -> tuple[f
     for repeat in range(REPEATS + 1):
         rows = [(repeat * size + offset) % len(states) for offset in range(size)]
         batch = states[rows], probabilities[rows], scene[rows]
-        start = time.process_time()
-        refinement(*batch)
-        times.append(time.process_time() - start)
-    return 1e3 * statistics.median(times[1:]) / size, 1e3 * min(times[1:]) / size
+        times.append(cpu_milliseconds(functools.partial(refinement, *batch), size)[1])
+    return statistics.median(times[1:]), min(times[1:])
 
 
 def numbers(words: Iterable[str]) -> dict[str, float]:

@@ -10,7 +10,6 @@ learned: the weights are those with which the generator made the records, and th
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -19,7 +18,7 @@ from scipy import stats
 from torch import Tensor
 
 from benchmarks.command_line import measuring, parser_of
-from benchmarks.measure import positive
+from benchmarks.measure import cpu_milliseconds, positive
 from benchmarks.rpi_runs import drawn
 from epo_lightning.data.rpi.scenes import RPIData
 from epo_lightning.data.rpi.subgames import FUTURE
@@ -116,18 +115,14 @@ def measure(split: str, count: int, overrides: Sequence[str]) -> None:
 
     def line(title: str, game: GameParameters) -> int:
         """Prints the errors of a game, and returns the number of alternative modes that are missed."""
-        start = time.process_time()
-        modes = games.missed(solver, energy, game)
-        spent = 1e3 * (time.process_time() - start) / count
+        modes, spent = cpu_milliseconds(lambda: games.missed(solver, energy, game), count)
         executed, alternative = (f"{mode.mean():.1e} ({mode.max():.1e})" for mode in modes)
         print(f"{title:16} executed {executed}  alternative {alternative}  {spent:.1f} ms of CPU per record")
         return int((modes[1] > MISSED).sum())
 
     missed = [line(f"{factor:g} w", games.game(factor)) for factor in FACTORS]
     print(f"alternative modes missed by more than 1 mm with the true w: {missed[0]} of {int(games.both.sum())}")
-    start = time.process_time()
-    calibrated = calibration(solver, energy, games.scene, games.game(FROM))
-    spent = 1e3 * (time.process_time() - start) / count
+    calibrated, spent = cpu_milliseconds(lambda: calibration(solver, energy, games.scene, games.game(FROM)), count)
     line(f"{FROM:g} w, calibrated", calibrated)
     found = calibrated.pair_weights["clearance"][:, 0, 0].square() / 2
     error = (found / games.weight - 1).abs()
