@@ -239,6 +239,32 @@ class FirstLine(Callback):
         print(f"{self._title}: {begun}{length}, in {self._folder}", flush=True)
 
 
+class ScoringLines(Callback):
+    """Callback that prints how many scenes are scored, every half minute: games that are solved to their end take minutes.
+
+    Args:
+        scenes: number of scenes that are scored.
+    """
+
+    every = 30.0
+    """Time [s] between two lines."""
+
+    def __init__(self, scenes: int) -> None:
+        self._scenes, self._scored = scenes, 0
+        self._began = self._told = time.monotonic()
+
+    def on_test_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, *_: Any
+    ) -> None:
+        self._scored += len(batch.history)
+        now = time.monotonic()
+        if now - self._told < self.every or self._scored >= self._scenes:
+            return
+        self._told = now
+        left = (now - self._began) * (self._scenes - self._scored) / self._scored
+        print(f"{self._scored} of {self._scenes} scenes scored, about {left:.0f} s left", flush=True)
+
+
 class Progress(Callback):
     """Callback that writes the current step to ``progress.json`` in the run folder every few seconds."""
 

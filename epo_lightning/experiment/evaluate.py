@@ -19,7 +19,7 @@ from epo_lightning import pretrained
 from epo_lightning.data.cache import file_digest
 from epo_lightning.data.rpi.scenes import RPIData
 from epo_lightning.experiment import assembly, gpus, logs
-from epo_lightning.experiment.callbacks import style_of
+from epo_lightning.experiment.callbacks import ScoringLines, style_of
 from epo_lightning.experiment.config.replaced import keys_of
 from epo_lightning.experiment.config.settings import EvaluateSettings, Settings, TrainerSettings
 from epo_lightning.experiment.opening import open_checkpoint, open_data, refuse_unfinished, settings_of, split_of
@@ -196,6 +196,7 @@ def _test(
             callbacks=[
                 *([] if truths is None else [truths]),
                 *([TQDMProgressBar(refresh_rate=of_run.callbacks.refresh)] if style == "bar" else []),
+                *([ScoringLines(len(loader.dataset))] if style == "lines" else []),
             ],
             logger=False,
             enable_checkpointing=False,

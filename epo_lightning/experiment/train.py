@@ -48,13 +48,16 @@ def folder_for(settings: Settings) -> RunFolder:
     return RunFolder(Path(settings.runs).expanduser() / group / name)
 
 
-def train(config: dict[str, Any], overrides: Sequence[str] = (), begun: RunFolder | None = None) -> RunFolder:
+def train(
+    config: dict[str, Any], overrides: Sequence[str] = (), begun: RunFolder | None = None, name: str = ""
+) -> RunFolder:
     """Train a forecaster as ``config`` describes, and score it if the configuration asks for it.
 
     Args:
         config: the resolved configuration of ``epo train`` as plain values; the code reads it as checked ``settings``.
         overrides: the user's overrides, recorded in run.json.
         begun: a run to continue; ``config`` is then the configuration in its folder. None for a new run.
+        name: name of the run in lines about its progress; title and seed if it is empty.
 
     Raises:
         ConfigError: the configuration cannot work, its data is missing, the folder holds a run already, or another process
@@ -86,7 +89,7 @@ def train(config: dict[str, Any], overrides: Sequence[str] = (), begun: RunFolde
             run.begin(config, _record(settings, config, data.digest, overrides))
         if not run.finished:
             with _errors_recorded(run), assembly.signals():
-                fit(settings, config, run, data, forecaster, devices)
+                fit(settings, config, run, data, forecaster, devices, name or f"{settings.title}, seed {settings.seed}")
         for which in settings.measures:
             if not run.metrics_file(which).is_file():
                 measure(run, settings, which, devices)
@@ -114,6 +117,7 @@ def fit(
     data: Any,
     forecaster: LightningModule,
     devices: int | list[int],
+    name: str,
 ) -> None:
     """Train from the beginning, or from the last finished epoch of the run, and record the result in run.json.
 
@@ -124,6 +128,7 @@ def fit(
         data: the data module.
         forecaster: the forecaster with its initial weights.
         devices: number or indices of devices, as :func:`.gpus.placed` yields them.
+        name: name of the run in lines about its progress.
     """
     started = time.monotonic()
     last = run.checkpoint("last") if run.checkpoint("last").is_file() else None
@@ -131,7 +136,7 @@ def fit(
     learned = assembly.parameters(forecaster)
     learns = learned > 0 and settings.trainer.max_steps != 0
     timer = Timer()  # its state is part of the checkpoint, so the time before a kill is counted as well
-    watchers = [*callbacks.run_callbacks(settings.callbacks, run, f"{settings.title}, seed {settings.seed}"), timer]
+    watchers = [*callbacks.run_callbacks(settings.callbacks, run, name), timer]
     if settings.trainer.graph:
         watchers.append(step_graph.StepGraph())
     strategy = None

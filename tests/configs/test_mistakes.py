@@ -194,6 +194,12 @@ def test_a_check_without_the_data_says_in_one_line_what_is_missing(
         ),
         (
             "experiment/mine.yaml",
+            "# @package _global_\ndefaults: [rpi/v_lstm, {backbone: hivt_m}]",
+            "experiment=mine",
+            r"if it stands in the defaults list of an experiment, write `- override /backbone: hivt_m`",
+        ),
+        (
+            "experiment/mine.yaml",
             "# @package _global_\ndefaults: [rpi/v_lstn, _self_]",
             "experiment=mine",
             r"in the defaults list of /.*experiment/mine\.yaml, .*: unknown option experiment=rpi/v_lstn: .* 'rpi/v_lstm'",

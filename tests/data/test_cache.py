@@ -66,6 +66,12 @@ def truncated(folder):
     return r"train.safetensors has \d+ bytes instead of \d+"
 
 
+def truncated_test(folder):
+    path = folder / "test.safetensors"
+    path.write_bytes(path.read_bytes()[:-1])
+    return r"test.safetensors has \d+ bytes instead of \d+"
+
+
 def altered(folder):
     path = folder / "train.safetensors"
     content = bytearray(path.read_bytes())
@@ -105,6 +111,7 @@ def with_another_configuration(folder):
     "damage",
     [
         truncated,
+        truncated_test,
         altered,
         deleted,
         without_manifest,

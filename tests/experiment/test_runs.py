@@ -205,12 +205,23 @@ def test_a_damaged_record_is_not_blamed_on_the_configuration(
     assert f"run/run.json: {key} is {value!r}, expected text" in refused("evaluate", "run=run")
 
 
+def test_a_folder_that_cannot_be_written_is_refused_before_anything_is_scored(
+    epo: Epo, refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert epo("train", ROW, *TINY, "run_dir=run") == 0
+    monkeypatch.setattr("os.access", lambda *_: False)  # root may write everywhere
+    assert "run cannot be written, and its scores are kept there" in refused("evaluate", "run=run", "split=val")
+    assert not Path("run/metrics-val.json").exists()
+
+
 def test_checkpoints_that_do_not_fit_are_refused(epo: Epo, refused: Callable[..., str]) -> None:
     assert epo("train", ROW, *TINY, "run_dir=sc") == 0
     assert epo("train", "experiment=rpi/v_lstm", *TINY, "run_dir=marginal") == 0
     assert "another architecture" in refused("evaluate", "run=sc", "checkpoint=marginal/checkpoints/best.ckpt")
     assert "not a checkpoint" in refused("evaluate", "run=sc", "checkpoint=sc/run.json")
     assert "no checkpoint" in refused("evaluate", "run=sc", "checkpoint=nowhere.ckpt")
+    Path("marginal/checkpoints/best.ckpt").unlink()
+    assert "best.ckpt; the folder has last.ckpt" in refused("evaluate", "run=marginal")
     Path("sc/checkpoints/best.ckpt").write_bytes(b"half a file")
     assert "not a checkpoint" in refused("predict", "run=sc", "out=out")
 

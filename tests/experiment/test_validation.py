@@ -104,6 +104,42 @@ def test_progress_lines_of_a_resumed_run_know_its_best_score(
     assert "epoch 5/9, step 50, loss 1.0000, val/minSADE 0.3000 (best 0.1000)" in capsys.readouterr().out
 
 
+def test_a_line_names_the_step_of_its_validation_if_the_epoch_goes_on_after_it(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    trainer: Any = SimpleNamespace(
+        sanity_checking=False,
+        checkpoint_callbacks=[],
+        callback_metrics={"val/minSADE": torch.tensor(0.3)},
+        current_epoch=1,
+        max_epochs=-1,
+        global_step=200,
+    )
+    model: Any = SimpleNamespace(step_means=StepMeans())
+    model.step_means.add({"train/loss": torch.tensor(1.0)}, 32)
+    lines = callbacks.EpochLines("a run", "val/minSADE")
+    lines.on_train_start(trainer, model)
+    lines.on_validation_end(trainer, model)
+    trainer.global_step = 380
+    lines.on_train_epoch_end(trainer, model)
+    assert "epoch 2, step 380, loss 1.0000, val/minSADE 0.3000 (at step 200, best 0.3000)" in capsys.readouterr().out
+    lines.on_train_epoch_end(trainer, model)
+    assert capsys.readouterr().out == ""
+
+
+def test_a_long_scoring_says_how_far_it_is(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter([0.0, 10.0, 40.0, 50.0, 80.0])
+    monkeypatch.setattr(callbacks.time, "monotonic", lambda: next(clock))
+    lines = callbacks.ScoringLines(scenes=50)
+    batch: Any = SimpleNamespace(history=range(10))
+    for number in range(4):
+        lines.on_test_batch_end(None, None, None, batch, number)  # type: ignore[arg-type]
+    assert capsys.readouterr().out.splitlines() == [
+        "20 of 50 scenes scored, about 60 s left",
+        "40 of 50 scenes scored, about 20 s left",
+    ]
+
+
 def test_a_training_that_is_shorter_than_the_steps_between_validations_is_validated_at_its_end(epo: Epo) -> None:
     assert epo(*WORDS, "trainer.max_steps=3", "trainer.validate_steps=200", "run_dir=run") == 0
     assert validated("run") == [2]

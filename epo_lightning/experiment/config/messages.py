@@ -197,6 +197,12 @@ def _missing_option(instance: Hydra, missing: str, message: str) -> str:
             f"begins with the line `name: {option}`; a folder of your own is searched with --config-dir <folder>. "
             f"{_known(option, options)}"
         )
+    part, _, choice = option.partition("/")
+    if group == "experiment" and choice and options_of(instance, part):
+        return (
+            f"unknown option {group}={option}: if it stands in the defaults list of an experiment, write "
+            f"`- override /{part}: {choice}`"
+        )
     if (file := Path("conf") / group / f"{option}.yaml").is_file():
         return f"unknown option {group}={option}: {file} is found with the option --config-dir conf"
     return f"unknown option {group}={option}: {_known(option, options)}"

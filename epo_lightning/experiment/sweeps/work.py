@@ -13,6 +13,7 @@ from epo_lightning.experiment import train as training
 from epo_lightning.experiment.config.settings import Settings
 from epo_lightning.experiment.sweeps.orphans import end_with
 from epo_lightning.experiment.sweeps.sweep import Job, Sweep
+from epo_lightning.experiment.sweeps.watch import names_of
 from epo_lightning.identity import identity
 from epo_lightning.masking import mask
 from epo_lightning.registry import kind_and_message
@@ -72,7 +73,7 @@ def work(sweep: Sweep, config: Mapping[str, Any], overrides: Sequence[str], opti
     try:
         if not record["jobs"]:
             sweep.add(job_of(config, overrides))
-        training.train(dict(config), [*overrides, *options])
+        training.train(dict(config), [*overrides, *options], name=names_of(sweep.jobs).get(run.path, ""))
     except Exception as error:
         message = mask(kind_and_message(error))
         message = message.replace(f"{sweep.root}{os.sep}", f"{os.path.relpath(sweep.root)}{os.sep}")
