@@ -39,7 +39,7 @@ FLOORS = {
     "metrics": {"scene", "forecast", "registry", "checks"},
     "decoders": {"scene", "registry", "checks", "game", "host", "warp_kernels"},
     "backbones": {"scene", "task", "registry", "encoders", "decoders"},
-    "data": {"scene", "frames", "registry", "schema", "checks", "task", "metrics"},
+    "data": {"scene", "frames", "registry", "schema", "checks", "task", "metrics", "files"},
     "objectives": {"scene", "forecast", "registry", "checks", "game", "solvers", "decoders", "losses", "schedules"},
     "forecasters": {
         "scene",

@@ -29,13 +29,14 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from epo_lightning.data.mapped import mapped, not_finite
+from epo_lightning.files import write_file as write_whole_file
 from epo_lightning.registry import ConfigError
 
 FORMAT = 1
 """Version of the layout. A data set of another version is refused."""
 MANIFEST = "manifest.json"
 LARGE = 1 << 31
-"""Size [bytes] from which on the file of a split is read piece by piece, and is checked only once."""
+"""Size [bytes] above which a split's file is memory-mapped, and its checksum computed only once."""
 SPLITS = ("train", "val", "test")
 PACKAGES = ("epo_lightning", "numba", "numpy", "safetensors", "torch")
 
@@ -139,15 +140,9 @@ def write_file(path: Path, content: bytes) -> None:
     Raises:
         OSError: the disk is full or read-only; the message names the file.
     """
-    # Processes with the same number may write the same file from several machines.
-    temporary = path.with_name(f".{path.name}.{platform.node()}-{os.getpid()}")
     with writing(path):
-        try:
-            temporary.write_bytes(content)
-            temporary.replace(path)
-        except BaseException:
-            temporary.unlink(missing_ok=True)
-            raise
+        path.parent.stat()  # a worker that outlives its command must not make a deleted folder again
+        write_whole_file(path, content)
 
 
 def write(

@@ -9,7 +9,6 @@ import os
 import stat
 import subprocess
 import sys
-from pathlib import Path
 from subprocess import PIPE
 
 import pytest
@@ -198,7 +197,7 @@ def test_a_full_disk_is_an_error_that_names_the_file(tmp_path, monkeypatch):
     def full_too(*_):
         raise SafetensorError("Error while serializing: I/O error: No space left on device (os error 28)")
 
-    monkeypatch.setattr(Path, "write_bytes", full)
+    monkeypatch.setattr("epo_lightning.files.os.fsync", full)
     monkeypatch.setattr(cache, "save_file", full_too)
     for use, name in (
         (lambda: cache.write_file(tmp_path / "game", b"1"), "game"),
@@ -208,6 +207,13 @@ def test_a_full_disk_is_an_error_that_names_the_file(tmp_path, monkeypatch):
             use()
         assert error.value.filename == str(tmp_path / name)
         assert not list(tmp_path.iterdir())
+
+
+def test_a_worker_whose_folder_was_deleted_does_not_make_it_again(tmp_path):
+    with pytest.raises(FileNotFoundError) as error:
+        cache.write_file(tmp_path / "parts" / "0", b"1")
+    assert error.value.filename == str(tmp_path / "parts" / "0")
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_path_that_cannot_be_looked_at_is_refused_with_advice(tmp_path):

@@ -71,7 +71,7 @@ def test_a_broken_part_is_solved_again_and_a_made_set_is_left_alone(data, tmp_pa
         (tmp_path / pool.name / path.name).write_bytes(path.read_bytes())
     broken = tmp_path / pool.name / "game-0001.safetensors"
     broken.write_bytes(broken.read_bytes()[:-100])
-    (broken.parent / ".game-0002.safetensors.99").write_bytes(b"half")  # of a process that was killed while it wrote
+    (broken.parent / ".game-0002.safetensors-0099abcd").write_bytes(b"half")  # of a process killed while it wrote
     other.generate(workers=1, progress=True)
     assert contents(other.folder) == contents(data.folder)
     assert re.fullmatch(r"solving games, 1 to do\ngame 3 of 3 solved, \d+ s\n", capfd.readouterr().err)
