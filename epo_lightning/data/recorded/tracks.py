@@ -13,10 +13,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from epo_lightning.data.errors import RecordingError
 from epo_lightning.data.recorded.lanes import FARTHEST, LaneGraph
@@ -43,6 +42,11 @@ def _first_text(values: np.ndarray) -> str | None:
         except (TypeError, ValueError):
             return str(value)
     return None
+
+
+def _first(bad: Bool[np.ndarray, " n"]) -> int:
+    """Index of the first entry that is True."""
+    return int(np.flatnonzero(bad)[0])
 
 
 @dataclass(frozen=True)
@@ -92,11 +96,24 @@ class TrackTable:
                 units, or an agent whose frames do not increase or that jumps.
         """
 
-        def first(bad: Any) -> int:
-            return int(np.flatnonzero(bad)[0])
-
         if not len(self.agent):
             raise RecordingError(path, "the recording has no tracks; at least one was expected")
+        self._check_types(path)
+        self._check_shapes(path)
+        if not (np.isfinite(self.rate) and 1.0 <= self.rate <= 1000.0):
+            raise RecordingError(path, f"a frame rate of {self.rate} Hz was expected to lie between 1 and 1000 Hz")
+        self._check_order(path)
+        self._check_units(path)
+        self._check_jumps(path, fastest)
+        self._check_sizes(path if sizes is None else sizes)
+        return self
+
+    def _check_types(self, path: Path | str) -> None:
+        """Refuse columns of another type than expected.
+
+        Raises:
+            RecordingError: the column and its type.
+        """
         for name in ("agent", "frame", "ids", "kind"):
             if not np.issubdtype((given := getattr(self, name)).dtype, np.integer):
                 how = NUMBERING.get(name, "number them")
@@ -106,13 +123,32 @@ class TrackTable:
                 text = _first_text(given)
                 what = f"of type {given.dtype}" if text is None else f"text, such as {text!r}"
                 raise RecordingError(path, f"{name} is {what}; floating-point numbers were expected")
-        self._check_shapes(path)
-        if not (np.isfinite(self.rate) and 1.0 <= self.rate <= 1000.0):
-            raise RecordingError(path, f"a frame rate of {self.rate} Hz was expected to lie between 1 and 1000 Hz")
+
+    def _check_shapes(self, path: Path | str) -> None:
+        """Refuse columns of another shape than the others have.
+
+        Raises:
+            RecordingError: the column, its shape and the expected one.
+        """
+        rows, agents = len(self.agent), len(self.ids)
+        shapes = {"frame": (rows,), "position": (rows, 2), "heading": (rows,), "velocity": (rows, 2)}
+        for name, shape in {**shapes, "size": (agents, 2), "kind": (agents,)}.items():
+            if (given := np.shape(getattr(self, name))) != shape:
+                column = "agent" if name in shapes else "ids"
+                raise RecordingError(
+                    path, f"{name} has the shape {given}; {shape} was expected, because {column} has {shape[0]} entries"
+                )
+
+    def _check_order(self, path: Path | str) -> None:
+        """Refuse rows that are not sorted by agent, and then by frame.
+
+        Raises:
+            RecordingError: the first row that is out of order.
+        """
         by_agent = np.diff(self.agent)
         backwards = (by_agent < 0) | ((by_agent == 0) & (np.diff(self.frame) <= 0))
         if backwards.any():
-            row = first(backwards) + 1
+            row = _first(backwards) + 1
             track, frame, before = self.ids[self.agent[row]], self.frame[row], self.frame[row - 1]
             if self.agent[row] == self.agent[row - 1] and frame == before:
                 raise RecordingError(
@@ -129,6 +165,13 @@ class TrackTable:
                 f"frame {frame} of track {track} comes after its frame {before}: frames of a track must increase, and an id "
                 "must belong to one agent",
             )
+
+    def _check_units(self, path: Path | str) -> None:
+        """Refuse numbers that are not finite or so large that their unit must be another one.
+
+        Raises:
+            RecordingError: the first such number.
+        """
         for name, values, limit, unit in (
             ("position", self.position, FARTHEST, "m"),
             ("heading", self.heading[:, None], 1e4, "rad"),
@@ -136,46 +179,44 @@ class TrackTable:
         ):
             bad = ~np.all(np.abs(values) <= limit, axis=1)
             if bad.any():
-                row = first(bad)
+                row = _first(bad)
                 raise RecordingError(
                     path,
                     f"{name} {values[row].tolist()} of track {self.ids[self.agent[row]]} in frame {self.frame[row]} was "
                     f"expected to be finite and at most {limit:g} {unit}: is it in another unit?",
                 )
+
+    def _check_jumps(self, path: Path | str, fastest: float) -> None:
+        """Refuse an agent that is faster than ``fastest`` [m/s] from one of its rows to the next.
+
+        Raises:
+            RecordingError: the first jump.
+        """
         way = np.linalg.norm(np.diff(self.position, axis=0), axis=1)
-        jumps = (by_agent == 0) & (way * self.rate > fastest * np.diff(self.frame))
+        jumps = (np.diff(self.agent) == 0) & (way * self.rate > fastest * np.diff(self.frame))
         if jumps.any():
-            row = first(jumps)
+            row = _first(jumps)
             raise RecordingError(
                 path,
                 f"track {self.ids[self.agent[row]]} jumps from {self.position[row].tolist()} to "
                 f"{self.position[row + 1].tolist()} m after its frame {self.frame[row]}: agents stay below {fastest:g} m/s; "
                 "is its id that of two agents, or a position wrong?",
             )
+
+    def _check_sizes(self, path: Path | str) -> None:
+        """Refuse sizes of agents that are not positive, or too large.
+
+        Raises:
+            RecordingError: the first such size.
+        """
         bad = ~np.all((self.size > 0) & (self.size <= LONGEST), axis=1)
         if bad.any():
-            agent = first(bad)
+            agent = _first(bad)
             raise RecordingError(
-                path if sizes is None else sizes,
+                path,
                 f"length and width {self.size[agent].tolist()} of track {self.ids[agent]} were expected to be positive "
                 f"and at most {LONGEST:g} m: are they in another unit?",
             )
-        return self
-
-    def _check_shapes(self, path: Path | str) -> None:
-        """Refuse columns of another shape than the others have.
-
-        Raises:
-            RecordingError: the column, its shape and the expected one.
-        """
-        rows, agents = len(self.agent), len(self.ids)
-        shapes = {"frame": (rows,), "position": (rows, 2), "heading": (rows,), "velocity": (rows, 2)}
-        for name, shape in {**shapes, "size": (agents, 2), "kind": (agents,)}.items():
-            if (given := np.shape(getattr(self, name))) != shape:
-                column = "agent" if name in shapes else "ids"
-                raise RecordingError(
-                    path, f"{name} has the shape {given}; {shape} was expected, because {column} has {shape[0]} entries"
-                )
 
 
 def together(parts: Sequence[TrackTable]) -> TrackTable:
