@@ -17,6 +17,7 @@ from epo_lightning.data import cache
 from epo_lightning.data.recorded.extraction import Extracted
 from epo_lightning.data.recorded.parts import Parts
 from epo_lightning.data.recorded.summary import by_unit, describe
+from epo_lightning.data.recorded.surroundings import FAR
 from epo_lightning.data.recorded.tables import INDEX_OF, SceneTables, shifted
 
 
@@ -136,5 +137,5 @@ def gather(
     moving = sum(extracted[name].about.get("moving agents", 0) for name in names)
     if moving:
         far = sum(extracted[name].about.get("ends far from lanes", 0) for name in names) / moving
-        about["moving agents that end over 10 m from all lanes given"] = far
+        about[f"moving agents that end over {FAR:g} m from all lanes given"] = far
     return {name: torch.from_numpy(values) for name, values in gathered.items()}, about

@@ -77,10 +77,10 @@ def _solver(counts: Mapping[str, int], solver: str) -> dict[str, Any]:
     }
 
 
-def _quantiles(values: NDArray, digits: tuple[float, ...] = (0.0, 0.5, 0.9, 0.99, 1.0)) -> dict[str, float]:
+def _quantiles(values: NDArray, levels: tuple[float, ...] = (0.0, 0.5, 0.9, 0.99, 1.0)) -> dict[str, float]:
     if not len(values):
         return {}
-    return {f"{q:g}": float(v) for q, v in zip(digits, np.quantile(values, digits), strict=True)}
+    return {f"{q:g}": float(v) for q, v in zip(levels, np.quantile(values, levels), strict=True)}
 
 
 def _nash(rows: Records) -> dict[str, Any]:
