@@ -18,9 +18,19 @@ from epo_lightning.checks import check_choice
 from epo_lightning.data import cache
 from epo_lightning.data.cache import SPLITS
 from epo_lightning.data.datamodule import SceneDataModule, SceneDataset
-from epo_lightning.data.recorded.routes import ACCELERATING, BEHIND, BEYOND, BRAKING, LINES, PER_LINE, POINTS
+from epo_lightning.data.recorded.routes import (
+    ACCELERATING,
+    BEHIND,
+    BEYOND,
+    BRAKING,
+    LINES,
+    PER_LINE,
+    POINTS,
+    SPACING,
+    VECTORS,
+)
 from epo_lightning.data.recorded.scenes import RecordedScenes
-from epo_lightning.data.recorded.windows import MOST_AGENTS, SPACING, VECTORS, WindowConfig
+from epo_lightning.data.recorded.windows import MOST_AGENTS, WindowConfig
 from epo_lightning.data.rpi.scenes import RPIData, RPIDataset
 from epo_lightning.metrics.functional.interaction import SUBSETS
 from epo_lightning.registry import ConfigError, register

@@ -8,13 +8,13 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
+from epo_lightning.data.recorded.assembling import common_axes
 from epo_lightning.data.recorded.lanes import LaneGraph
 from epo_lightning.data.recorded.routes import Routes, pieces
 from epo_lightning.data.recorded.scenes import RecordedScenes
 from epo_lightning.data.recorded.surroundings import nearest_pieces
 from epo_lightning.data.recorded.tables import SceneTables
-from epo_lightning.data.recorded.windows import SPACING, VECTORS, WindowConfig
-from epo_lightning.frames import AGREE
+from epo_lightning.data.recorded.windows import WindowConfig
 from epo_lightning.scene import HEADING, SPEED, Scene
 
 
@@ -42,7 +42,7 @@ class RoadScenes:
                 f"windows.lines is {self.windows.lines}: lines through junctions are made of recordings only"
             )
         self._routes = Routes(lanes)
-        self._pieces = pieces(lanes, VECTORS, SPACING)
+        self._pieces = pieces(lanes)
 
     def on_lanes(self, states: Float[np.ndarray, "n 4"]) -> Bool[np.ndarray, " n"]:
         """Mask of the vehicles that are on a lane of the map; only these can be in a scene."""
@@ -92,13 +92,9 @@ class RoadScenes:
             )
         route = self._routes.of(now[:, :2], now[:, SPEED], here, self.windows.horizon * self.windows.dt)
         limit = self.lanes.speed_limit[here.lane]
-        counted = (agent_mask & first)[..., None]
-        heading = history[:, :, -1, HEADING]
-        centre, ahead = (
-            np.where(counted, values, 0.0).sum(1) / counted.sum(1)
-            for values in (history[:, :, -1, :2], np.stack((np.cos(heading), np.sin(heading)), -1))
-        )
-        scattered = np.linalg.norm(ahead, axis=1) < AGREE
+        counted = agent_mask & first
+        last = np.where(counted[..., None], history[:, :, -1], 0.0)
+        centre, direction = common_axes(last[..., :2], last[..., HEADING], counted)
         origin = np.floor(centre)
         turns = 2 * np.pi * np.round(now[:, HEADING] / (2 * np.pi))
         past = history[there].copy()
@@ -125,7 +121,7 @@ class RoadScenes:
             agents=place,
             lanes=rows,
             centre=centre - origin,
-            direction=np.where(scattered, heading[:, 0], np.arctan2(ahead[:, 1], ahead[:, 0])),
+            direction=direction,
             recording=np.arange(len(origin), dtype=np.int32),
             frame=np.zeros(len(origin), dtype=np.int64),
             origin=origin,

@@ -28,6 +28,8 @@ BACKWARDS, FORWARDS = 100.0, 500.0
 """Distances [m] over which the lanes before and after a lane are followed."""
 SHORTEST = 10.0
 """Smallest length [m] of the range of goal candidates."""
+VECTORS, SPACING = 10, 6.0
+"""Vectors V of a lane polyline and their largest length [m]."""
 
 
 @dataclass(frozen=True)
@@ -140,7 +142,7 @@ def polyline_length(line: Polyline) -> float:
     return float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
 
 
-def follow(lane: int, following: np.ndarray, length: np.ndarray, distance: float) -> list[int]:
+def follow(lane: int, following: Int[np.ndarray, " W"], length: Float[np.ndarray, " W"], distance: float) -> list[int]:
     """A lane and the lanes that follow it, up to ``distance`` [m] beyond its end or until a lane repeats."""
     chain, gone = [lane], 0.0
     while gone < distance:
@@ -168,7 +170,7 @@ def _first_beside(
     return found, distance
 
 
-def pieces(lanes: LaneGraph, vectors: int, spacing: float) -> Float[np.ndarray, "T V+1 2"]:
+def pieces(lanes: LaneGraph, vectors: int = VECTORS, spacing: float = SPACING) -> Float[np.ndarray, "T V+1 2"]:
     """Lane polylines for the network: all centrelines cut into pieces of V ``vectors`` of at most ``spacing`` [m] each."""
     longest = vectors * spacing
     length = lanes.centrelines.length

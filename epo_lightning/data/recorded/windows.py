@@ -1,4 +1,4 @@
-"""Extraction of scenes from recordings: the choice of agents and moments, and their data (Appendix D.2, "exiD").
+"""Extraction of scenes from recordings: the choice of agents and moments (Appendix D.2, "exiD").
 
 A window is a moment of a recording (t0) with a focal agent and its neighbours. Windows that pass all filters become scenes.
 Scenes share agents: a vehicle at one moment may be the centre of one scene and a neighbour in others. Its data are stored
@@ -18,19 +18,14 @@ from jaxtyping import Bool, Int
 
 from epo_lightning.checks import check_number, check_whole
 from epo_lightning.data.errors import RecordingError
+from epo_lightning.data.recorded.assembling import assemble
 from epo_lightning.data.recorded.clock import TOO_SHORT, Stretches, stretches
-from epo_lightning.data.recorded.junctions import Junctions
 from epo_lightning.data.recorded.lanes import Located, lane_changes
-from epo_lightning.data.recorded.routes import BEYOND, Routes, pieces, reach
-from epo_lightning.data.recorded.surroundings import nearest_pieces, reachable_pieces
 from epo_lightning.data.recorded.tables import SceneTables
 from epo_lightning.data.recorded.tracks import Recording
-from epo_lightning.frames import AGREE
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import KINDS
 
-VECTORS, SPACING = 10, 6.0
-"""Vectors V of a lane polyline and their largest length [m]."""
 BESIDE_LANES = [KINDS.index(kind) for kind in ("pedestrian", "bicycle")]
 """Kinds of agents that often move beside the lanes of vehicles."""
 STANDING = 2.0
@@ -178,7 +173,7 @@ def extract(recording: Recording, config: WindowConfig) -> tuple[SceneTables | N
     counts["scenes"] = len(moments)
     if not len(moments):
         return None, dict(counts)
-    return _assemble(recording, config, clock, located, moments, members), dict(counts)
+    return assemble(recording, config, clock, located, moments, _rows(clock, moments, members)), dict(counts)
 
 
 def _on_lanes(clock: Stretches, recording: Recording) -> tuple[Located, Int[np.ndarray, " Z"]]:
@@ -287,88 +282,3 @@ def _crowds(
         there = place < present[rows, None]
         at = np.where(there, begin[rows, None] + place, 0)
         yield moments[rows], np.where(there, stretch[at], -1), there & focal[at]
-
-
-def _assemble(
-    recording: Recording,
-    config: WindowConfig,
-    clock: Stretches,
-    located: Located,
-    moments: Int[np.ndarray, " scenes"],
-    members: Int[np.ndarray, "scenes N"],
-) -> SceneTables:
-    """The tables of the selected windows."""
-    rows = _rows(clock, moments, members)
-    used, place = np.unique(rows, return_inverse=True)
-    place = place.reshape(rows.shape)
-    if used[0] < 0:
-        used, place = used[1:], place - 1
-    origin = np.floor(clock.state[:, :2].mean(0))
-    owner = clock.owner[used]
-    begin, end = clock.start[owner], clock.start[owner] + clock.count[owner] - 1
-    turns = 2 * np.pi * np.round(clock.now[used, 2] / (2 * np.pi))
-
-    def states(steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        at = used[:, None] + steps
-        real = (at >= begin[:, None]) & (at <= end[:, None])
-        found = clock.state[np.clip(at, begin[:, None], end[:, None])]
-        if clock.ending is not None and steps[-1] == 0:
-            recent = min(clock.ending.shape[1], len(steps))
-            found[:, len(steps) - recent :] = clock.ending[used, recent - 1 :: -1]
-        found[..., :2] -= origin
-        found[..., 2] -= turns[:, None]
-        return np.where(real[..., None], found, 0.0).astype(np.float32), real
-
-    history, history_mask = states(np.arange(1 - config.history, 1))
-    future, future_mask = states(np.arange(1, config.horizon + 1))
-    agent = clock.agent[owner]
-    now = clock.now[used]
-    at = now[place, :2]
-    there = (place >= 0)[..., None]
-    centre = (at * there).sum(1) / there.sum(1)
-    heading = now[place, 2]
-    ahead = np.stack([(f(heading) * there[..., 0]).sum(1) for f in (np.cos, np.sin)], 1)
-    # If headings oppose each other, their mean has no meaning, and the heading of the focal agent is used.
-    scattered = np.linalg.norm(ahead, axis=1) < AGREE * there[..., 0].sum(1)
-    direction = np.where(scattered, heading[:, 0], np.arctan2(ahead[:, 1], ahead[:, 0]))
-    candidates, references = np.empty((len(used), 0, 2)), np.empty((len(used), 0, 0, 2))
-    speed, polylines = np.empty((len(used), 0)), np.empty((0, VECTORS + 1, 2))
-    lines, near = None, nearest_pieces(polylines, centre, config.lanes or 0)
-    if recording.lanes is not None:
-        here = Located(located.lane[used], located.along[used], located.offset[used])
-        time = config.horizon * config.dt
-        if config.lines is None:
-            route = Routes(recording.lanes).of(now[:, :2], now[:, 3], here, time)
-        else:
-            route = Junctions(recording.lanes, config.lines).of(now[:, :2], now[:, 2], now[:, 3], here, time)
-            lines = None if route.count is None else route.count.astype(np.int32)
-        candidates, references = route.candidates - origin, route.references - origin
-        limit = recording.lanes.speed_limit[here.lane]
-        speed = np.where(np.isnan(limit), config.speed_limit, limit)
-        polylines = pieces(recording.lanes, VECTORS, SPACING)
-        if config.lanes is None:
-            _, far = reach(now[:, 3], time)
-            near = reachable_pieces(polylines, now[:, :2], far + BEYOND, place, centre)
-        else:
-            near = nearest_pieces(polylines, centre, config.lanes)
-    return SceneTables(
-        history=history,
-        history_mask=history_mask,
-        future=future,
-        future_mask=future_mask,
-        size=recording.tracks.size[agent].astype(np.float32),
-        kind=recording.tracks.kind[agent],
-        track=recording.tracks.ids[agent],
-        candidates=candidates.astype(np.float32),
-        references=references.astype(np.float32),
-        reference_speed=speed.astype(np.float32),
-        polylines=polylines - origin,
-        agents=place.astype(np.int32),
-        lanes=near,
-        centre=centre - origin,
-        direction=direction,
-        recording=np.zeros(len(moments), dtype=np.int32),
-        frame=np.round(moments * config.dt * recording.tracks.rate).astype(np.int64),
-        origin=origin[None],
-        lines=lines,
-    )

@@ -11,8 +11,8 @@ import torch
 from data.recorded.window_scenes import scenes_of
 from epo_lightning.data.errors import RecordingError
 from epo_lightning.data.recorded.road_scenes import RoadScenes
-from epo_lightning.data.recorded.routes import BEYOND, reach
-from epo_lightning.data.recorded.windows import SPACING, WindowConfig, extract
+from epo_lightning.data.recorded.routes import BEYOND, SPACING, reach
+from epo_lightning.data.recorded.windows import WindowConfig, extract
 from epo_lightning.scene import KINDS
 
 from .roads import FOUR, recording
