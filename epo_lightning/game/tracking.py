@@ -42,7 +42,7 @@ def observed_controls(
     with torch.no_grad():
         start, dt = scene.current_or_zero, scene.dt
         future = torch.where(seen[..., None], future, 0.0)
-        told = demonstrated(scene)
+        known = demonstrated(scene)
         if isinstance(dynamics, Unicycle):
             controls = _differences(start, future, seen, dt)
         else:
@@ -52,7 +52,7 @@ def observed_controls(
         missed = torch.where(seen[..., None], future[..., :2] - states[..., :2], 0.0)
         for _ in range(steps):
             trial = controls + _step(
-                _reach(dynamics, start, controls, states, dt), missed, controls - guess, seen, told
+                _reach(dynamics, start, controls, states, dt), missed, controls - guess, seen, known
             )
             reached = dynamics.rollout(start, trial, dt)
             left = torch.where(seen[..., None], future[..., :2] - reached[..., :2], 0.0)
@@ -148,16 +148,16 @@ def _step(
     missed: Float[Tensor, "B N K 2"],
     corrected: Float[Tensor, "B N K 2"],
     seen: Bool[Tensor, "B N K"],
-    told: Bool[Tensor, "B N K"],
+    known: Bool[Tensor, "B N K"],
 ) -> Float[Tensor, "B N K 2"]:
     """One Gauss-Newton step: ``missed`` are the remaining offsets, ``corrected`` the correction so far."""
     batch, agents, steps = seen.shape
     jacobian = torch.where(seen[..., None], moved, 0.0).flatten(3).permute(1, 2, 0, 3)  # [B, N, 2 K, 2 K]
     matrix = jacobian @ jacobian.mT
     diagonal = matrix.diagonal(dim1=-2, dim2=-1).unflatten(-1, (steps, 2))
-    mean = diagonal.sum(-2) / told.sum(-1, keepdim=True).clamp_min(1)  # [B, N, 2]
+    mean = diagonal.sum(-2) / known.sum(-1, keepdim=True).clamp_min(1)  # [B, N, 2]
     # The smoothness term couples neighbouring controls that are both determined.
-    link = told[..., 1:].to(missed)
+    link = known[..., 1:].to(missed)
     difference = torch.eye(steps, dtype=missed.dtype, device=missed.device).diff(dim=0)
     smooth = difference.mT @ (link[..., None] * difference)  # [B, N, K, K]
     block = matrix.view(batch, agents, steps, 2, steps, 2)
