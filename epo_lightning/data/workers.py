@@ -44,7 +44,7 @@ class Report:
     def __init__(
         self,
         tasks: Sequence[Arguments],
-        unit_of: Callable[[Arguments], Any],
+        unit_of: Callable[[Any], Any],
         unit: str,
         doing: str,
         done: str,

@@ -61,14 +61,14 @@ def launching(overrides: Sequence[str], jobs: int, extra: Sequence[str]) -> Laun
         with _progress(left, report):
             for attempt in range(1, ATTEMPTS + 1):
                 broken = _launch_once(left, overrides, jobs, extra)
-                left = [task for task in left if not task[3].is_file()]
+                left = [task for task in left if not task.file.is_file()]
                 if not left:
                     return
                 if attempt < ATTEMPTS:
                     print(f"{broken or 'jobs were lost'}: {len(left)} parts are left", flush=True)
         raise CacheError(
             f"{len(left)} of {len(tasks)} parts were not extracted ({broken or 'jobs were lost'}); finished parts are kept "
-            f"in {tasks[0][3].parent}: run the same command again"
+            f"in {tasks[0].file.parent}: run the same command again"
         )
 
     return launch
@@ -80,7 +80,7 @@ def _launch_once(tasks: Sequence[PartTask], overrides: Sequence[str], jobs: int,
     Raises:
         Exception: a job failed; its own error.
     """
-    work = tasks[0][3].parent.resolve()
+    work = tasks[0].file.parent.resolve()
     for earlier in work.glob("jobs-*"):
         shutil.rmtree(earlier, ignore_errors=True)
     folder = work / f"jobs-{time.time_ns():x}"
@@ -128,26 +128,26 @@ def job(config: DictConfig) -> None:
     with contextlib.suppress(OSError):
         os.chdir(content["directory"])
     end_with(content["process"])
-    tasks = [(file, *task) for task in content["tasks"]]
-    report = Report(tasks, lambda task: task[4], "part", "extracting", "extracted", 0, show=False)
+    tasks = [(file, task) for task in content["tasks"]]
+    report = Report(tasks, lambda task: task[1].file, "part", "extracting", "extracted", 0, show=False)
     for _ in finished(_extract, tasks, config.workers or 1, report, f"finished parts are kept in {file.parent.parent}"):
         pass
 
 
-def _extract(file: Path, *task: Any) -> None:
+def _extract(file: Path, task: PartTask) -> None:
     """Extract a part, unless it is there or the file of the job is gone."""
-    if file.is_file() and outcomes(task[3]) is None:
+    if file.is_file() and outcomes(task.file) is None:
         extract_to_file(*task)
 
 
 @contextmanager
 def _progress(tasks: Sequence[PartTask], report: Report) -> Iterator[None]:
     """Context that reports parts when their files appear."""
-    waiting = {task[3].name: task for task in tasks}
+    waiting = {task.file.name: task for task in tasks}
     ended = threading.Event()
 
     def look() -> None:
-        there = waiting.keys() & {file.name for file in tasks[0][3].parent.iterdir()}
+        there = waiting.keys() & {file.name for file in tasks[0].file.parent.iterdir()}
         for name in sorted(there):
             report.advance(waiting.pop(name))
 

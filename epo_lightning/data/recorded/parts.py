@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from safetensors import safe_open
@@ -25,8 +25,18 @@ from epo_lightning.data.workers import Report, finished
 MOST = 10_000
 """Largest number of parts: file systems slow down with millions of files."""
 
-PartTask = tuple[Sequence[RecordingSource], WindowConfig, bool, Path, bool, bool]
-"""Arguments of :func:`~epo_lightning.data.recorded.extraction.extract_to_file`."""
+
+class PartTask(NamedTuple):
+    """Arguments of :func:`~epo_lightning.data.recorded.extraction.extract_to_file`, which explains them."""
+
+    sources: Sequence[RecordingSource]
+    windows: WindowConfig
+    has_map: bool
+    file: Path
+    strict: bool
+    keep: bool
+
+
 Launch = Callable[[Sequence[PartTask], Report], None]
 """Function that has parts extracted and reports them, and returns when all of them are there."""
 Value = TypeVar("Value")
@@ -63,7 +73,10 @@ class Parts:
 
     def tasks(self, windows: WindowConfig, has_map: bool, strict: bool, keep: bool) -> list[PartTask]:
         """The missing parts, each as the arguments of the function that extracts it."""
-        return [(self.members[number], windows, has_map, self.files[number], strict, keep) for number in self.missing()]
+        return [
+            PartTask(self.members[number], windows, has_map, self.files[number], strict, keep)
+            for number in self.missing()
+        ]
 
     def extract(self, tasks: Sequence[PartTask], workers: int | None, progress: bool, launch: Launch | None) -> None:
         """Extract parts into their files.
@@ -78,7 +91,7 @@ class Parts:
             CacheError: a worker was killed.
         """
         unit, before = "recording" if self.size == 1 else "part", len(self.files) - len(tasks)
-        report = Report(tasks, lambda task: task[3], unit, "extracting", "extracted", before, progress)
+        report = Report(tasks, lambda task: task.file, unit, "extracting", "extracted", before, progress)
         if launch and tasks:
             launch(tasks, report)
         else:

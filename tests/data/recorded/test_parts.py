@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import signal
 from dataclasses import replace
 from functools import partial
@@ -120,12 +121,13 @@ def test_only_missing_and_damaged_parts_are_extracted_again(folder, monkeypatch)
 def test_a_job_whose_file_is_gone_extracts_nothing_more(folder, tmp_path):
     module = data(folder)
     tasks = Parts(tmp_path, module.sources()).tasks(module.windows, True, True, False)
+    assert pickle.loads(pickle.dumps(tasks[0]))[1:] == tasks[0][1:], "jobs get their parts in a file"
     file = tmp_path / "0.pickle"
-    generation._extract(file, *tasks[0])
+    generation._extract(file, tasks[0])
     assert not reads(folder)
     file.touch()
     for _ in range(2):
-        generation._extract(file, *tasks[0])
+        generation._extract(file, tasks[0])
     assert reads(folder) == ["a-0"]
 
 
