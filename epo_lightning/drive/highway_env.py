@@ -17,25 +17,17 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from epo_lightning.checks import check_choice, check_whole
+from epo_lightning.checks import check_choice
 from epo_lightning.data.recorded.lanes import LANE, LaneGraph, Polylines
 from epo_lightning.drive.ride import WINDOWS, Moment, Position
-from epo_lightning.drive.traffic import TrafficWorld
+from epo_lightning.drive.traffic import ASIDE, PER_SEED, TOGETHER, TrafficWorld, first_seed
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import HEADING, KINDS
 
-SEEDS = 1_000_000
-"""Added to seeds of episodes."""
-APART = 1000
-"""Distance of the first episodes of two consecutive seeds, and so the largest number of episodes."""
-TOGETHER = 25
-"""Number of episodes that are driven together."""
 SUBSTEPS = 3
 """Steps of 1/15 s, those of the environments, in one step of a planner."""
 SPACING = 2.0
 """Largest distance [m] between two points of a line of the map."""
-ASIDE = 0.3
-"""Distance [m] of the centre from the lanes at which a vehicle is off the road."""
 CLOSED = 0.5
 """Largest distance [m] of a line's end from the next one's begin that is no gap."""
 MIRROR = np.array([1.0, -1.0])
@@ -70,9 +62,26 @@ class Setting:
 
 
 SETTINGS = {
-    "merge": Setting("merge-v1", -1, 0.0, ("j", "k", "b", "c", "d"), -90.0, 30.0, 20.0, 1.0),
+    "merge": Setting(
+        environment="merge-v1",
+        vehicle=-1,
+        back=0.0,
+        route=("j", "k", "b", "c", "d"),
+        beyond=-90.0,
+        speed=30.0,
+        seconds=20.0,
+        gap=1.0,
+    ),
     "roundabout": Setting(
-        "roundabout-v1", 0, 15.0, ("ser", "ses", "se", "ex", "ee", "nx", "nxs", "nxr"), -117.5, 12.0, 24.0, 8.0, 0.2
+        environment="roundabout-v1",
+        vehicle=0,
+        back=15.0,
+        route=("ser", "ses", "se", "ex", "ee", "nx", "nxs", "nxr"),
+        beyond=-117.5,
+        speed=12.0,
+        seconds=24.0,
+        gap=8.0,
+        turning=0.2,
     ),
 }
 """The environments by their names in ``others``."""
@@ -103,14 +112,9 @@ class HighwayEnvSimulator:
     together = TOGETHER
 
     def __init__(self, episodes: int, seed: int, place: str) -> None:
-        check_whole("episodes", episodes)
-        if episodes > APART:
-            raise ConfigError(
-                f"episodes must be {APART} or fewer in world=highway_env, not {episodes}: further ones are those of the "
-                "next seed; drive several seeds"
-            )
+        first = first_seed("highway_env", episodes, seed, PER_SEED)
         check_choice("place", place, SETTINGS, "highway-env")
-        self._episodes, self._seed, self._setting = episodes, (SEEDS + seed) * APART, SETTINGS[place]
+        self._episodes, self._seed, self._setting = episodes, first, SETTINGS[place]
         self._environment = _environment(self._setting.environment)
         self._environment.reset(seed=self._seed)
         self.roads = Roads(self._environment.road.network, self._setting)

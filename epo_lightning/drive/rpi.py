@@ -24,19 +24,17 @@ from epo_lightning.data.rpi.modes import cheapest
 from epo_lightning.data.rpi.scenes import DISC_DIAMETER
 from epo_lightning.data.rpi.solve import PotentialSettings, solve, solve_potential
 from epo_lightning.data.rpi.subgames import HISTORY, by_agent, main_starts
-from epo_lightning.drive.world import EGO, Outcome, Search
+from epo_lightning.drive.world import EGO, SEEDS, Outcome, Search
 from epo_lightning.forecast import GameParameters
 from epo_lightning.game.feature_energy import FeatureEnergy
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import Scene
 
 PEDESTRIANS = ("plays", "ignores")
-SEEDS = 1_000_000
-"""Added to seeds of episodes, so that their games are none of those of a data set."""
 TOGETHER = 50
-"""Largest number of episodes begun together: with fewer an episode takes longer, with more progress is rarely told."""
+"""Largest number of episodes begun together. Fewer take longer per episode; with more, progress is reported less often."""
 RECONSIDERED = 5
-"""Steps after which a pedestrian who plays looks for a better solution than that near its plan."""
+"""Steps after which a pedestrian that plays looks for a better solution than that near its plan."""
 _SETTINGS = PotentialSettings()
 _BOTH = np.ones(AGENTS)
 ENERGY = FeatureEnergy(

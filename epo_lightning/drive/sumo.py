@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from epo_lightning.checks import check_choice, check_whole
+from epo_lightning.checks import check_choice
 from epo_lightning.data.recorded.formats.lanelet2 import read_map
 from epo_lightning.data.recorded.lanes import LaneGraph
 from epo_lightning.data.simulate.demand import CLASSES, STYLES
@@ -29,24 +29,16 @@ from epo_lightning.data.simulate.motion import SLOWEST, strip_at
 from epo_lightning.data.simulate.traffic import simulator
 from epo_lightning.drive.ride import WINDOWS, Moment, Position
 from epo_lightning.drive.sumo_process import END, OWN, STEP, Branch, Vehicles, serve
-from epo_lightning.drive.traffic import TrafficWorld
+from epo_lightning.drive.traffic import ASIDE, PER_SEED, TOGETHER, TrafficWorld, first_seed
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import KINDS
 
-SEEDS = 1_000_000
-"""Added to seeds of episodes, so that their traffic is that of no data set."""
 MERGES = tuple(layout.id for layout in LAYOUTS if sum(np.isfinite(strip.join) for strip in layout.lanes) == 1)
 """Layouts with an on-ramp of one lane, which all vehicles on it have to leave."""
-TOGETHER = 25
-"""Number of simulations that run side by side."""
 PER_STREAM = 4
 """Episodes of one simulation."""
-APART = 1000
-"""Distance of the first streams of two consecutive seeds, and so the largest number of streams."""
 BEYOND = 50.0
 """Distance [m] behind the end of the acceleration lane at which a vehicle has arrived."""
-ASIDE = 0.3
-"""Distance [m] of the centre from the nearest lane at which a vehicle is off the road."""
 SECONDS = 24.0
 """Longest duration of an episode."""
 ENDED = "the process of SUMO ended: is there enough memory?"
@@ -80,17 +72,12 @@ class SumoSimulator:
     together = TOGETHER
 
     def __init__(self, episodes: int, seed: int, style: str) -> None:
-        check_whole("episodes", episodes)
-        if episodes > APART * PER_STREAM:
-            raise ConfigError(
-                f"episodes must be {APART * PER_STREAM} or fewer in world=sumo, not {episodes}: further ones are those of "
-                "the next seed; drive several seeds"
-            )
+        first = first_seed("sumo", episodes, seed, PER_SEED * PER_STREAM)
         check_choice("traffic", style, STYLES, "SUMO")
         simulator()
         if not hasattr(os, "fork"):
             raise ConfigError("world=sumo branches episodes off by os.fork, which Linux and macOS have")
-        self._episodes, self._seed, self._style = episodes, (SEEDS + seed) * APART, style
+        self._episodes, self._seed, self._style = episodes, first, style
         self.steps = round(SECONDS / WINDOWS.dt)
         self._maps: dict[int, LaneGraph] = {}
 

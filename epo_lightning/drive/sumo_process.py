@@ -26,25 +26,28 @@ from jaxtyping import Float
 
 from epo_lightning.data.simulate.demand import STYLES, Style
 from epo_lightning.data.simulate.layout import LAYOUTS, Layout
-from epo_lightning.data.simulate.traffic import WARM_UP, Simulation, brake, kind_of, running
+from epo_lightning.data.simulate.traffic import WARM_UP, RunningSumo, brake, kind_of, running, slow_down
 from epo_lightning.registry import ConfigError
 
 OWN, END = "own", "end"
 """Messages: the planned vehicle drives by its own driver for a step; the episode is over."""
 RATE, STEP = 10, 2
-"""Steps per second [Hz], and in one step of a planner (0.2 s). Recordings take 25 Hz, and 2.5 times as long."""
+"""Steps per second [Hz], and steps of SUMO in one step of a planner (0.2 s).
+
+Recordings have 25 Hz, which takes 2.5 times as long.
+"""
 HISTORY = 10
 """Steps of a planner that are known when an episode begins."""
 TAKEN = 60.0
 """Distance [m] before the place where the ramp meets the road at which an episode begins."""
-APART = 8.0
+PAUSE = 8.0
 """Smallest time [s] between the beginnings of two episodes of a stream."""
 LONGEST = 3600.0
 """Longest duration [s] of a stream after the warm-up."""
 FILLING = 2.0
 """Time [s] after the warm-up before the first episode begins."""
 AROUND = 250.0
-"""Distance [m] along the road from the planned vehicle within which vehicles are told; no farther one is a neighbour."""
+"""Distance [m] along the road from the planned vehicle within which vehicles are sent; none beyond it can be a neighbour."""
 PATIENCE = 120.0
 """Time [s] within which an episode has to begin; without one, the stream is given up."""
 
@@ -148,7 +151,7 @@ def _serve(pipe: Connection) -> None:
 
 
 def _episode(pipe: Connection, road: _Road, branch: Branch) -> None:
-    """Simulate an episode in this process, and end the process: with status 1 if an error could not be told."""
+    """Simulate an episode, then end this process; its status is 1 if an error could not be sent."""
     status = 1
     try:
         road.hesitate = _Hesitation(STYLES[branch.style], (branch.layout, branch.seed, branch.number))
@@ -199,7 +202,7 @@ def _stream(branch: Branch, pipe: Connection) -> Generator[_Road]:
             if road.time > free + PATIENCE:
                 raise ConfigError(f"no vehicle comes down the ramp of layout {layout.name}: use another seed")
             if taken := road.arriving():
-                road.taken, free = taken, road.time + APART
+                road.taken, free = taken, road.time + PAUSE
                 yield road
 
 
@@ -211,7 +214,7 @@ class _Road:
         taken: name of the vehicle that an episode takes over.
     """
 
-    def __init__(self, layout: Layout, simulation: Simulation, style: Style) -> None:
+    def __init__(self, layout: Layout, simulation: RunningSumo, style: Style) -> None:
         self.layout, self.simulation = layout, simulation
         self.history: deque[Vehicles] = deque(maxlen=HISTORY)
         self.taken = ""
@@ -300,7 +303,7 @@ class _Hesitation:
         self.style, self.seed = style, seed
         self._of: dict[str, tuple[np.random.Generator, float]] = {}
 
-    def __call__(self, simulation: Simulation, names: Sequence[str], time: float) -> None:
+    def __call__(self, simulation: RunningSumo, names: Sequence[str], time: float) -> None:
         if self.style.every is None:
             return
         for name in names:
@@ -309,7 +312,5 @@ class _Hesitation:
                 self._of[name] = random, time + random.exponential(self.style.every)
             random, when = self._of[name]
             if time >= when:
-                seconds = random.uniform(*self.style.lasting)
-                slower = simulation.libsumo.vehicle.getSpeed(name) - seconds * random.uniform(*self.style.braking)
-                simulation.libsumo.vehicle.slowDown(name, max(slower, 0.0), seconds)
+                slow_down(simulation.libsumo, name, self.style, random)
                 self._of[name] = random, time + random.exponential(self.style.every)

@@ -16,17 +16,25 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from epo_lightning.checks import check_whole
 from epo_lightning.data.recorded.lanes import LaneGraph
 from epo_lightning.data.recorded.road_scenes import RoadScenes
 from epo_lightning.drive.ride import WINDOWS, Ride, Simulation, contacts
 from epo_lightning.drive.road_game import ENERGY, road_game
-from epo_lightning.drive.world import EGO, Outcome, Search
+from epo_lightning.drive.world import EGO, SEEDS, Outcome, Search
 from epo_lightning.forecast import GameParameters
 from epo_lightning.game.dynamics import Unicycle
+from epo_lightning.registry import ConfigError
 from epo_lightning.scene import HEADING, SPEED, Scene
 
 NEAR = 6
 """Number of vehicles, the nearest ones to the planned one, of which measures are taken at each moment."""
+PER_SEED = 1000
+"""Number of simulator seeds that one seed of the world may use."""
+TOGETHER = 25
+"""Number of episodes that are driven together."""
+ASIDE = 0.3
+"""Distance [m] of the centre from the nearest lane at which a vehicle is off the road."""
 
 
 class Simulator(Protocol):
@@ -51,6 +59,27 @@ class Simulator(Protocol):
     def close(self) -> None:
         """End the simulator."""
         ...
+
+
+def first_seed(world: str, episodes: int, seed: int, most: int) -> int:
+    """The first simulator seed of a world's seed, after a check of the number of episodes.
+
+    Args:
+        world: name of the world, for the message.
+        episodes: number of episodes.
+        seed: seed of the world.
+        most: largest number of episodes of one seed.
+
+    Raises:
+        ConfigError: no whole number of episodes, or more than ``most``.
+    """
+    check_whole("episodes", episodes)
+    if episodes > most:
+        raise ConfigError(
+            f"episodes must be {most} or fewer in world={world}, not {episodes}: further ones are those of the next seed; "
+            "drive several seeds"
+        )
+    return (SEEDS + seed) * PER_SEED
 
 
 class TrafficWorld:

@@ -15,6 +15,8 @@ from epo_lightning.scene import Scene
 
 EGO = 0
 """Index of the planned agent in the scenes and outcomes of a world."""
+SEEDS = 1_000_000
+"""Added to the seeds of episodes, so that no data set has their random numbers."""
 
 
 @dataclass(frozen=True)

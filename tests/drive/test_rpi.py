@@ -14,7 +14,8 @@ from epo_lightning.data.rpi.subgames import HISTORY
 from epo_lightning.drive.episodes import play
 from epo_lightning.drive.measures import measure
 from epo_lightning.drive.planners import ForecastPlanner, GamePlanner, Planner, ResponsePlanner
-from epo_lightning.drive.rpi import SEEDS, RPIWorld
+from epo_lightning.drive.rpi import RPIWorld
+from epo_lightning.drive.world import SEEDS
 from epo_lightning.registry import ConfigError
 from epo_lightning.scene import SPEED
 

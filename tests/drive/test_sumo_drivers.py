@@ -11,7 +11,7 @@ from typing import cast
 import pytest
 
 from epo_lightning.data.simulate.demand import STYLES
-from epo_lightning.data.simulate.traffic import Simulation
+from epo_lightning.data.simulate.traffic import RunningSumo
 
 pytest.importorskip("libsumo", reason="SUMO cannot be loaded", exc_type=ImportError)
 
@@ -30,7 +30,7 @@ def brakings(names: Sequence[str], seconds: float, speed: float = 30.0, style: s
         getSpeed=lambda name: speed,
         slowDown=lambda name, slower, lasting: found.append((name, slower, lasting)),
     )
-    simulation = cast(Simulation, SimpleNamespace(libsumo=SimpleNamespace(vehicle=vehicle)))
+    simulation = cast(RunningSumo, SimpleNamespace(libsumo=SimpleNamespace(vehicle=vehicle)))
     hesitate = _Hesitation(STYLES[style], (0, 1, 2))
     for step in range(round(10 * seconds)):
         hesitate(simulation, names, step / 10)

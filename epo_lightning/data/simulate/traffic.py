@@ -89,13 +89,18 @@ def brake(libsumo: ModuleType, names: Iterable[str], style: Style, rate: int, ra
         return
     for name in names:
         if random.random() < 1 / (style.every * rate):
-            seconds = random.uniform(*style.lasting)
-            slower = libsumo.vehicle.getSpeed(name) - seconds * random.uniform(*style.braking)
-            libsumo.vehicle.slowDown(name, max(slower, 0.0), seconds)
+            slow_down(libsumo, name, style, random)
+
+
+def slow_down(libsumo: ModuleType, name: str, style: Style, random: np.random.Generator) -> None:
+    """Let a driver brake, for a time and by a deceleration that are drawn."""
+    seconds = random.uniform(*style.lasting)
+    slower = libsumo.vehicle.getSpeed(name) - seconds * random.uniform(*style.braking)
+    libsumo.vehicle.slowDown(name, max(slower, 0.0), seconds)
 
 
 @dataclass(frozen=True)
-class Simulation:
+class RunningSumo:
     """SUMO while it runs in this process.
 
     Attributes:
@@ -116,7 +121,7 @@ class Simulation:
 @contextmanager
 def running(
     layout: Layout, seed: Sequence[int], seconds: float, folder: Path, rate: int = RATE, style: Style = STYLES["free"]
-) -> Iterator[Simulation]:
+) -> Iterator[RunningSumo]:
     """A simulation at its first moment, with traffic for some time after the warm-up; it is closed at the end.
 
     SUMO keeps its state in global variables, so there is one simulation in a process at a time.
@@ -155,7 +160,7 @@ def running(
     ]
     try:
         libsumo.start(command)
-        yield Simulation(libsumo, random, edges, where, {row["id"]: row for row in drivers})
+        yield RunningSumo(libsumo, random, edges, where, {row["id"]: row for row in drivers})
     except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
         raise ConfigError(f"SUMO fails on layout {layout.name} with seed {list(seed)}: {error}") from None
     finally:
