@@ -23,14 +23,14 @@ from torch import Tensor
 
 from benchmarks.command_line import measuring, parser_of
 from benchmarks.runs import opened
-from epo_lightning.drive.episodes import outside, play
+from epo_lightning.drive.episodes import chunks, outside, play
 from epo_lightning.drive.measures import differences, estimate, measure
 from epo_lightning.drive.planners import ForecastPlanner, ResponsePlanner
 from epo_lightning.drive.ride import Moment
 from epo_lightning.drive.road_game import keep_going
 from epo_lightning.drive.traffic import TrafficWorld
 from epo_lightning.drive.world import EGO
-from epo_lightning.drive.worlds import place
+from epo_lightning.drive.worlds import world_entry
 from epo_lightning.forecast import GameParameters
 from epo_lightning.forecasters.base import Forecaster
 from epo_lightning.game.dynamics import Unicycle
@@ -139,8 +139,7 @@ def _names(now: Moment, positions: Float[np.ndarray, "N 2"], mask: Tensor) -> li
 def drive(world: TrafficWorld, planners: Mapping[str, ResponsePlanner]) -> Mapping[str, Mapping[str, Tensor]]:
     """Measures of all episodes by planner."""
     found: dict[str, dict[str, list[Tensor]]] = {}
-    for first in range(0, len(world), world.together):
-        chunk = range(first, min(first + world.together, len(world)))
+    for chunk in chunks(world):
         for name, planner in planners.items():
             for key, values in measure(play(world, planner, chunk), world).items():
                 found.setdefault(name, {}).setdefault(key, []).append(values)
@@ -155,7 +154,7 @@ def report(runs: Sequence[str], traffic: str, episodes: int, watched: int, seed:
         ConfigError: a run or a kind of traffic that does not exist, a run that is not finished or of other data, or SUMO is
             not installed.
     """
-    where = place("sumo")
+    where = world_entry("sumo")
     where.check_kinds("sumo", (traffic,))
     forecasters: dict[str, Forecaster | None] = {KEEPING: None}
     for path in runs:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -75,12 +75,12 @@ def play(world: World, planner: Planner | None, episodes: Sequence[int], keep_pl
             plans.append(_spread(outside(plan.states[..., :2], scene), going, count, torch.nan))
         last = going, scene, plan
     outcome = world.outcome()
-    told = _told(outcome, world.dt)
+    executed = _executed(outcome, world.dt)
     return Episodes(
         dt=world.dt,
         outcome=outcome,
-        controls=torch.stack(controls, 1) if controls else told,
-        found=torch.stack(found, 1) if found else torch.ones(told.shape[:2], dtype=torch.bool),
+        controls=torch.stack(controls, 1) if controls else executed,
+        found=torch.stack(found, 1) if found else torch.ones(executed.shape[:2], dtype=torch.bool),
         plans=plans,
         wall=wall,
         processor=processor,
@@ -98,7 +98,7 @@ def _spread(values: Tensor, going: Int[Tensor, " b"], count: int, rest: float) -
     return values.new_full((count, *values.shape[1:]), rest).index_copy_(0, going, values)
 
 
-def _told(outcome: Outcome, dt: float) -> Float[Tensor, "B T 2"]:
+def _executed(outcome: Outcome, dt: float) -> Float[Tensor, "B T 2"]:
     """Changes of the planned agent's speed and heading per second; NaN after the end of an episode."""
     changes = controls_between(outcome.states[:, EGO], dt)
     return changes.where(outcome.agent_mask[:, EGO, 1:, None], torch.nan)
@@ -110,6 +110,12 @@ def outside(position: Float[Tensor, "B N K 2"], scene: Scene) -> Float[Tensor, "
     if scene.frame is not None:
         position = in_world(position, scene.frame.double())
     return position.where(scene.agent_mask[:, : position.shape[1], None, None], torch.nan)
+
+
+def chunks(world: World) -> Iterator[range]:
+    """All episodes of a world, as many at a time as can be begun together."""
+    for first in range(0, len(world), world.together):
+        yield range(first, min(first + world.together, len(world)))
 
 
 def times(world: World, planner: Planner, episodes: Sequence[int]) -> tuple[list[float], list[float]]:

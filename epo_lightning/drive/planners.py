@@ -90,8 +90,12 @@ class Plan(Batch):
 
 def shifted(controls: Float[Tensor, "*batch K 2"], steps: int) -> Float[Tensor, "*batch steps 2"]:
     """Strategies one step later: the first controls are dropped, and controls of zero are added or the end is cut."""
-    rest = controls[..., 1:, :]
-    return F.pad(rest, (0, 0, 0, max(0, steps - rest.shape[-2])))[..., :steps, :]
+    return resized(controls[..., 1:, :], steps)
+
+
+def resized(controls: Float[Tensor, "*batch K 2"], steps: int) -> Float[Tensor, "*batch steps 2"]:
+    """Controls over a number of steps: controls of zero are added at the end, or the end is cut."""
+    return F.pad(controls, (0, 0, 0, max(0, steps - controls.shape[-2])))[..., :steps, :]
 
 
 def constant(speed: Float[Tensor, " B"], acceleration: float, steps: int, dt: float) -> Float[Tensor, "B K 2"]:
@@ -309,9 +313,8 @@ class ResponsePlanner(_OfGame):
         controls = (torch.zeros_like(game.initial_controls) if usual is None else usual).clone()
         if self.forecast is None:
             return controls
-        told, steps = self.forecast.controls_of_all(scene), controls.shape[-2]
-        told = F.pad(told, (0, 0, 0, max(0, steps - told.shape[-2])))[..., :steps, :]
-        controls[:, 0, : told.shape[1]] = told.nan_to_num(0.0).to(controls)
+        forecast = resized(self.forecast.controls_of_all(scene), controls.shape[-2])
+        controls[:, 0, : forecast.shape[1]] = forecast.nan_to_num(0.0).to(controls)
         return controls
 
 

@@ -17,7 +17,7 @@ CONSTANT_VELOCITY, BEST_RESPONSE, JOINT, DRIVER = "constant_velocity", "best_res
 
 
 @dataclass(frozen=True)
-class Place:
+class WorldEntry:
     """A world as ``epo drive`` knows it.
 
     Attributes:
@@ -78,8 +78,8 @@ _ASSUMED = {
     BEST_RESPONSE: "iterated best response, assumed game",
     JOINT: "assumed game",
 }
-WORLDS: Mapping[str, Place] = {
-    "rpi": Place(
+WORLDS: Mapping[str, WorldEntry] = {
+    "rpi": WorldEntry(
         kinds=PEDESTRIANS,
         make=RPIWorld,
         refuse=_of_rpi,
@@ -89,13 +89,13 @@ WORLDS: Mapping[str, Place] = {
             JOINT: "true game",
         },
     ),
-    "sumo": Place(
+    "sumo": WorldEntry(
         kinds=("dense", "free"),
         make=_sumo,
         refuse=_of_roads,
         baselines={DRIVER: "SUMO's driver", **_ASSUMED},
     ),
-    "highway_env": Place(
+    "highway_env": WorldEntry(
         kinds=("merge", "roundabout"),
         make=_highway_env,
         refuse=_of_roads,
@@ -105,7 +105,7 @@ WORLDS: Mapping[str, Place] = {
 """The worlds by their names in ``world``."""
 
 
-def place(world: str) -> Place:
+def world_entry(world: str) -> WorldEntry:
     """A world by name.
 
     Raises:

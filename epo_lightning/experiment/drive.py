@@ -17,13 +17,13 @@ from epo_lightning.checks import check_choice
 from epo_lightning.data.cache import digest, file_digest
 from epo_lightning.data.rpi.game import RECIPE
 from epo_lightning.drive.driven import Driven
-from epo_lightning.drive.episodes import play, times
+from epo_lightning.drive.episodes import chunks, play, times
 from epo_lightning.drive.film import film
 from epo_lightning.drive.measures import UNITS, Estimate, differences, estimates, measure
 from epo_lightning.drive.planners import ForecastPlanner, GamePlanner, Planner, ResponsePlanner
 from epo_lightning.drive.progress import Progress
 from epo_lightning.drive.world import World
-from epo_lightning.drive.worlds import BEST_RESPONSE, CONSTANT_VELOCITY, DRIVER, Place, place
+from epo_lightning.drive.worlds import BEST_RESPONSE, CONSTANT_VELOCITY, DRIVER, WorldEntry, world_entry
 from epo_lightning.experiment import assembly
 from epo_lightning.experiment.config.settings import DriveSettings
 from epo_lightning.experiment.opening import open_checkpoint, settings_of
@@ -63,7 +63,7 @@ def drive(settings: DriveSettings, tell: Callable[[str], None]) -> list[Path]:
     torch.set_num_threads(1)
     out = folder_of(settings)
     _check_free(out)
-    where = place(settings.world)
+    where = world_entry(settings.world)
     kinds = where.kinds if settings.others is None else tuple(settings.others)
     where.check_kinds(settings.world, kinds)
     planners: dict[str, Make] = {}
@@ -91,7 +91,7 @@ def _deciding(settings: DriveSettings) -> dict[str, Any]:
 
 def _compare(
     settings: DriveSettings,
-    where: Place,
+    where: WorldEntry,
     kinds: Sequence[str],
     planners: Mapping[str, Make],
     out: Path,
@@ -133,8 +133,7 @@ def _drive(
 ) -> None:
     """Drive all episodes of a world with all planners."""
     progress = Progress(kind, len(world), planners, tell)
-    for first in range(0, len(world), world.together):
-        chunk = range(first, min(first + world.together, len(world)))
+    for chunk in chunks(world):
         for name, planner in planners.items():
             if driven.has(kind, name, chunk):
                 progress.skip(name, len(chunk))
@@ -186,7 +185,7 @@ def _digests(settings: DriveSettings) -> dict[str, str]:
     return {path: file_digest(RunFolder.open(path).checkpoint(settings.checkpoint))[:16] for path in paths}
 
 
-def _planners(settings: DriveSettings, where: Place, tell: Callable[[str], None]) -> Iterator[tuple[str, Make]]:
+def _planners(settings: DriveSettings, where: WorldEntry, tell: Callable[[str], None]) -> Iterator[tuple[str, Make]]:
     """Planners by name, made for a world."""
     paths = settings.run if settings.ways else []
     runs = [RunFolder.open(path) for path in paths]

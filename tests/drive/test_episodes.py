@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import cast
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 import torch
 from torch import Tensor
 
-from epo_lightning.drive.episodes import play
+from epo_lightning.drive.episodes import chunks, play
 from epo_lightning.drive.planners import Plan
 from epo_lightning.drive.world import Outcome, World
 from epo_lightning.scene import Scene
@@ -155,3 +156,14 @@ def test_plans_are_kept_in_coordinates_of_the_world(world: MovingFrames) -> None
         assert plan[0, 1].isnan().all(), "this agent is not there"
         torch.testing.assert_close(plan[2], wanted)
         assert bool(plan[1].isnan().all()) == (step > 0)
+
+
+@pytest.mark.parametrize(
+    ("together", "expected"), [(2, [[0, 1], [2, 3], [4]]), (5, [[0, 1, 2, 3, 4]]), (8, [[0, 1, 2, 3, 4]])]
+)
+def test_all_episodes_are_driven_in_chunks_of_those_that_can_be_begun_together(together: int, expected: object) -> None:
+    class Five(SimpleNamespace):
+        def __len__(self) -> int:
+            return 5
+
+    assert [list(chunk) for chunk in chunks(cast(Any, Five(together=together)))] == expected
