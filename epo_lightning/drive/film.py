@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -16,9 +16,9 @@ from matplotlib.patches import Circle, Rectangle
 from matplotlib.transforms import Affine2D
 
 from epo_lightning.drive.episodes import Episodes
+from epo_lightning.drive.measures import touching
 from epo_lightning.drive.world import EGO
 from epo_lightning.files import whole_file
-from epo_lightning.metrics.functional.overlap import overlaps_with
 from epo_lightning.report.animation import write_gif
 from epo_lightning.report.style import style
 from epo_lightning.scene import HEADING
@@ -86,7 +86,7 @@ class _View:
         self.mask, self.size = happened.agent_mask[0].numpy(), happened.size[0].numpy()
         self.plans = [plan[0].numpy() @ turn for plan in seen.plans]
         self.steps = self.states.shape[1]
-        self.contact = _contact(seen, shape)
+        self.contact = touching(happened, shape)[0].numpy()
         axis.set_title(textwrap.fill(name, LETTERS * (1 + follows)), fontsize=7)
         axis.set_aspect("equal")
         axis.set_xticks([])
@@ -123,12 +123,3 @@ class _View:
             return Circle((x, y), size[0] / 2, color=color, zorder=5)
         turned = Affine2D().rotate(heading).translate(x, y) + self.axis.transData
         return Rectangle((-size[0] / 2, -size[1] / 2), size[0], size[1], color=color, zorder=5, transform=turned)
-
-
-def _contact(seen: Episodes, shape: str) -> Bool[np.ndarray, " T+1"]:
-    """Steps at which the planned agent touches another one."""
-    happened = seen.outcome
-    states = happened.states[0].transpose(0, 1)[:, :, None]
-    size = happened.size.expand(len(states), -1, -1)
-    touch = overlaps_with(EGO, states, size, happened.agent_mask[0].T, shape)
-    return touch.flatten(1).any(1).numpy()

@@ -70,7 +70,7 @@ def measure(episodes: Episodes, world: World) -> dict[str, Float[Tensor, " B"]]:
     offset = (happened.states[:, 1:, :, :2] - happened.states[:, :1, :, :2]).norm(dim=-1)
     offset = offset.where(with_ego[:, 1:], torch.inf)
     return {
-        "collision": _touches(happened, world.shape).double(),
+        "collision": touching(happened, world.shape).any(1).double(),
         "distance": offset.amin((1, 2)),
         "time_to_collision": _time_to_collision(happened, world.shape),
         "progress": happened.progress[:, -1],
@@ -87,12 +87,13 @@ def _mean(values: Float[Tensor, "B T"]) -> Float[Tensor, " B"]:
     return values.nanmean(1).nan_to_num(0.0)
 
 
-def _touches(happened: Outcome, shape: str) -> Tensor:
+def touching(happened: Outcome, shape: str) -> Bool[Tensor, "B T+1"]:
+    """Steps at which the body of the planned agent, ``disc`` or ``box``, overlaps that of another one."""
     batch, agents, steps = happened.agent_mask.shape
     states = happened.states.transpose(1, 2).reshape(batch * steps, agents, 1, 4)
     mask = happened.agent_mask.transpose(1, 2).reshape(batch * steps, agents)
     touch = overlaps_with(EGO, states, happened.size.repeat_interleave(steps, 0), mask, shape)
-    return touch.flatten(1).any(1).view(batch, steps).any(1)
+    return touch.flatten(1).any(1).view(batch, steps)
 
 
 def _time_to_collision(happened: Outcome, shape: str) -> Float[Tensor, " B"]:

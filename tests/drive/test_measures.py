@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from epo_lightning.drive.episodes import Episodes
-from epo_lightning.drive.measures import SOON, differences, estimate, measure
+from epo_lightning.drive.measures import SOON, differences, estimate, measure, touching
 from epo_lightning.drive.world import Outcome, World
 
 DT, STEPS = 0.1, 40
@@ -57,6 +57,14 @@ def test_contact_and_distance() -> None:
     gone = meeting(0.6)
     gone.outcome.agent_mask[:, 0, 15:] = False  # the robot is at most at 1.4 m, and the agent stands at 2 m
     assert values(gone)["distance"] == pytest.approx((0.6**2 + 0.6**2) ** 0.5)
+
+
+def test_the_steps_of_a_contact() -> None:
+    # The robot is at 2 m after 20 steps, and discs of 0.25 m touch where it is less than 0.22 m away from there.
+    happened = meeting(0.45).outcome
+    assert touching(happened, "disc")[0].nonzero()[:, 0].tolist() == [18, 19, 20, 21, 22]
+    happened.agent_mask[:, 1, 20:] = False
+    assert touching(happened, "disc")[0].nonzero()[:, 0].tolist() == [18, 19]
 
 
 def test_time_to_collision_is_the_smallest_over_the_way() -> None:
