@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterable
 
 SILENCE = 30.0
-"""Seconds after which the next chunk of episodes is told. The first chunk of every planner is told in any case."""
+"""Time [s] between two lines about a planner; the first chunk always has one."""
 
 
 class Progress:

@@ -1,4 +1,4 @@
-"""The costs that a planned vehicle is told on a road, and what it believes about those of the others.
+"""The known costs of a planned vehicle on a road, and the costs that it assumes for the others.
 
 Planners that are given costs minimise :data:`ENERGY` over the next seconds. The planned vehicle follows a reference line,
 comes near the reference speed, drives smoothly and keeps its distance. The others want what they would do if they kept their
