@@ -150,7 +150,7 @@ def extract(folder: Path, root: Path, workers: int) -> dict[str, float]:
         for _ in finished(extract_to_file, tasks, workers, report, ""):
             pass
         cost["extract"] = time.perf_counter() - begin
-        files = [task[3] for task in tasks]
+        files = [task.file for task in tasks]
         cost["parts"], cost["bytes of parts"] = len(files), sum(file.stat().st_size for file in files)
 
     with peak() as memory:

@@ -78,7 +78,7 @@ FLOORS = {
         "report",
         "files",
     },
-    "report": {"scene", "forecast", "registry", "files", "run_folder", "identity", "masking"},
+    "report": {"checks", "scene", "forecast", "registry", "files", "run_folder", "identity", "masking"},
 }
 """Top-level modules that each one may import besides itself; `experiment` and `cli` may import all."""
 
