@@ -12,6 +12,10 @@ A trained forecaster from any folder::
 The futures of any other model, made scene-consistent::
 
     forecast = epo_lightning.refine(states, probabilities, scene)
+
+A picture of a forecast::
+
+    epo_lightning.draw(scene, forecast, "scene.png")
 """
 
 from __future__ import annotations
@@ -29,6 +33,7 @@ if TYPE_CHECKING:
     from epo_lightning.game.feature_energy import FeatureEnergy
     from epo_lightning.predictions import read_predictions, write_predictions
     from epo_lightning.refinement import refine
+    from epo_lightning.report.scenes import draw
     from epo_lightning.scene import Scene
     from epo_lightning.solvers.gauss_newton.levenberg_marquardt import LevenbergMarquardt
 
@@ -45,6 +50,7 @@ _HOMES = {
     "LaneGraph": "data.recorded.lanes",
     "LevenbergMarquardt": "solvers.gauss_newton.levenberg_marquardt",
     "RoadScenes": "data.recorded.road_scenes",
+    "draw": "report.scenes",
     "read_predictions": "predictions",
     "refine": "refinement",
     "write_predictions": "predictions",
@@ -62,6 +68,7 @@ __all__ = [
     "Solution",
     "Status",
     "Unicycle",
+    "draw",
     "load",
     "read_predictions",
     "refine",

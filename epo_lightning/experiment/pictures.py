@@ -46,11 +46,11 @@ def draw(
         ids = list(range(len(ids)))
     drawn: list[tuple[Path, list[int]]] = []
     if settings.figures and is_traffic(scenes, shape):
-        from epo_lightning.report.scenes import highway_scene
+        from epo_lightning.report.scenes import draw as draw_scene
 
         for row in eventful(scenes, settings.figures):
             path, name = folder / f"scene_{ids[row]}.png", f"{title}, scene {ids[row]}"
-            drawn.append((highway_scene(scenes[row], forecast[row], path, name), [row]))
+            drawn.append((draw_scene(scenes[row], forecast[row], path, name), [row]))
     elif settings.figures and scenes.future is not None:
         from epo_lightning.report.figures import joint_predictions
 

@@ -14,7 +14,7 @@ from epo_lightning.experiment.pictures import choose, eventful, forecast_of, is_
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.figures import joint_predictions
 from epo_lightning.report.rows import Row
-from epo_lightning.report.scenes import highway_comparison
+from epo_lightning.report.scenes import draw_rows
 from epo_lightning.report.style import AGENTS
 from epo_lightning.report.weights import learned_weights
 from epo_lightning.run_folder import RunFolder
@@ -58,7 +58,7 @@ def draw(rows: Iterable[Row], folder: Path) -> tuple[list[Path], list[str]]:
     if is_traffic(scenes, shape):
         for number, index in enumerate(eventful(scenes, SCENES), 1):
             forecasts = {title: forecast_of(forecaster, scenes[index]) for title, forecaster in forecasters.items()}
-            drawn.append(highway_comparison(scenes[index], forecasts, folder / f"scene_{number}.png"))
+            drawn.append(draw_rows(scenes[index], forecasts, folder / f"scene_{number}.png"))
     else:
         shown, others = pairs(scenes, SCENES)
         other = None if others is None or scenes.future is None else scenes.future[others]

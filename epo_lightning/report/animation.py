@@ -43,7 +43,7 @@ def animate(scene: Scene, forecast: JointForecast, path: str | Path, title: str 
     """Animation of the history and the most likely joint mode in real time, with the ground truth as outlines.
 
     Args:
-        scene, forecast, title: as for :func:`~epo_lightning.report.scenes.highway_scene`.
+        scene, forecast, title: as for :func:`~epo_lightning.report.scenes.draw`.
         path: path of the animation, which ends in .gif (equal scenes give equal bytes) or .mp4.
 
     Returns:
@@ -51,7 +51,7 @@ def animate(scene: Scene, forecast: JointForecast, path: str | Path, title: str 
 
     Raises:
         ConfigError: another ending, or an .mp4 without an installed ffmpeg.
-        ValueError: as for :func:`~epo_lightning.report.scenes.highway_scene`.
+        ValueError: as for :func:`~epo_lightning.report.scenes.draw`.
     """
     path = Path(path)
     ending = path.suffix.lower()

@@ -19,7 +19,7 @@ MOST_MODES = 6
 """Largest number of panels of a picture of one forecaster."""
 
 
-def highway_scene(scene: Scene, forecast: JointForecast, path: str | Path, title: str = "") -> Path:
+def draw(scene: Scene, forecast: JointForecast, path: str | Path, title: str = "") -> Path:
     """Picture of all joint modes of a forecast, one panel each, most likely first (Figs. 10 and 11). Returns its path.
 
     Each agent has one colour, which grows stronger with the predicted steps; the ground truth goes from grey to black.
@@ -42,15 +42,15 @@ def highway_scene(scene: Scene, forecast: JointForecast, path: str | Path, title
     return _picture(scene, futures, path, title)
 
 
-def highway_comparison(scene: Scene, forecasts: Mapping[str, JointForecast], path: str | Path) -> Path:
+def draw_rows(scene: Scene, forecasts: Mapping[str, JointForecast], path: str | Path) -> Path:
     """Picture of the most likely joint mode of several forecasters, one panel each (Fig. 4). Returns its path.
 
     Args:
-        scene, path: as for :func:`highway_scene`.
+        scene, path: as for :func:`draw`.
         forecasts: forecasts of this scene, by the name of the row in the tables.
 
     Raises:
-        ValueError: as for :func:`highway_scene`, or there is no forecast.
+        ValueError: as for :func:`draw`, or there is no forecast.
     """
     if not forecasts:
         raise ValueError("comparison without forecasts: nothing to draw")

@@ -18,7 +18,7 @@ from matplotlib.patches import Polygon
 from epo_lightning.report import animation
 from epo_lightning.report import scenes as pictures
 from epo_lightning.report.animation import animate
-from epo_lightning.report.scenes import highway_scene
+from epo_lightning.report.scenes import draw
 from epo_lightning.report.style import HISTORY, TRUTH, VEHICLES
 
 from .traffic_scenes import DT, SIZES, boxes, forecast, short, traffic
@@ -64,7 +64,7 @@ def test_every_panel_has_the_trajectories_of_its_mode_in_the_colours_of_the_agen
     scene = traffic()
     assert scene.future is not None
     predicted = forecast(scene)
-    highway_scene(scene, predicted, tmp_path / "scene.png")
+    draw(scene, predicted, tmp_path / "scene.png")
     centre = scene.current[0, :, :2].numpy().mean(0)
     observed = torch.cat([scene.history, scene.future], dim=2)[0, ..., :2].numpy() - centre
     for mode, axes in zip((2, 1, 0), drawn[0].axes, strict=True):  # the most likely one first
@@ -82,7 +82,7 @@ def test_every_panel_has_the_trajectories_of_its_mode_in_the_colours_of_the_agen
 
 def test_the_legend_has_the_colours_of_the_vehicles(tmp_path: Path, drawn: list[Figure]) -> None:
     scene = traffic()
-    highway_scene(scene, forecast(scene), tmp_path / "scene.png")
+    draw(scene, forecast(scene), tmp_path / "scene.png")
     (figure,) = drawn
     entries = {
         text.get_text(): handle
@@ -106,7 +106,7 @@ def test_vehicles_point_where_they_head(tmp_path: Path, drawn: list[Figure]) -> 
     scene.history[0, 1:3, -1, 3] = 30.0
     predicted = forecast(scene)
     predicted.states[0, 2, 0, -1, 2] = 0.2
-    highway_scene(scene, predicted, tmp_path / "scene.png")
+    draw(scene, predicted, tmp_path / "scene.png")
     axes = drawn[0].axes[0]
     centre = scene.current[0, :, :2].numpy().mean(0)
     for i, heading in enumerate(headings):

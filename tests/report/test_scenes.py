@@ -18,7 +18,7 @@ from torch import Tensor
 from epo_lightning.forecast import JointForecast
 from epo_lightning.report import scenes as pictures
 from epo_lightning.report.scene_view import LONGEST
-from epo_lightning.report.scenes import highway_comparison, highway_scene
+from epo_lightning.report.scenes import draw, draw_rows
 from epo_lightning.report.style import TRUTH, VEHICLES
 from epo_lightning.scene import KINDS, Scene
 
@@ -58,7 +58,7 @@ def pixels(path: Path) -> np.ndarray:
 
 def test_a_panel_for_each_mode_the_most_likely_first(tmp_path: Path, drawn: list[Figure]) -> None:
     scene = traffic()
-    path = highway_scene(scene, forecast(scene), tmp_path / "deep" / "scene.png", "EPO, scene 3")
+    path = draw(scene, forecast(scene), tmp_path / "deep" / "scene.png", "EPO, scene 3")
     assert min(pixels(path).shape[:2]) > 300
     (figure,) = drawn
     titles = [axes.get_title(loc="left") for axes in figure.axes]
@@ -72,7 +72,7 @@ def test_a_panel_for_each_mode_the_most_likely_first(tmp_path: Path, drawn: list
 def test_vehicles_stand_to_scale_where_they_are(tmp_path: Path, drawn: list[Figure]) -> None:
     scene = traffic()
     predicted = forecast(scene)
-    highway_scene(scene, predicted, tmp_path / "scene.png")
+    draw(scene, predicted, tmp_path / "scene.png")
     (axes, *_) = drawn[0].axes
     centre = scene.current[0, :, :2].numpy().mean(0)
     for i in range(4):
@@ -105,8 +105,8 @@ def test_the_picture_does_not_depend_on_the_frame_of_the_recording(tmp_path: Pat
     elsewhere = dataclasses.replace(scene, history=turn(scene.history), future=turn(scene.future), lanes=lanes)
     game = dataclasses.replace(predicted.parameters, goals=turn(predicted.parameters.goals))
     there = dataclasses.replace(predicted, states=turn(predicted.states), parameters=game)
-    highway_scene(scene, predicted, tmp_path / "here.png")
-    highway_scene(elsewhere, there, tmp_path / "there.png")
+    draw(scene, predicted, tmp_path / "here.png")
+    draw(elsewhere, there, tmp_path / "there.png")
     for one, other in zip(drawn[0].axes, drawn[1].axes, strict=True):
         np.testing.assert_allclose(one.get_xlim() + one.get_ylim(), other.get_xlim() + other.get_ylim(), atol=1e-3)
         for color in VEHICLES[:4]:
@@ -118,14 +118,14 @@ def test_the_picture_does_not_depend_on_the_frame_of_the_recording(tmp_path: Pat
 def test_oncoming_traffic_does_not_turn_the_picture(tmp_path: Path, drawn: list[Figure]) -> None:
     scene = traffic()
     scene.history[0, 1, :, 2] = torch.pi
-    highway_scene(scene, forecast(scene), tmp_path / "scene.png")
+    draw(scene, forecast(scene), tmp_path / "scene.png")
     (corners,) = boxes(drawn[0].axes[0], VEHICLES[2])
     np.testing.assert_allclose(np.ptp(corners, axis=0), SIZES[2], rtol=1e-5)
 
 
 def test_only_lanes_within_the_picture_are_drawn(tmp_path: Path, drawn: list[Figure]) -> None:
     scene = traffic()
-    highway_scene(scene, forecast(scene), tmp_path / "scene.png")
+    draw(scene, forecast(scene), tmp_path / "scene.png")
     (axes, *_) = drawn[0].axes
     bands = [patch.get_path().get_extents() for patch in axes.patches if isinstance(patch, PathPatch)]
     middle = float(scene.current[0, :, 1].mean())
@@ -134,18 +134,18 @@ def test_only_lanes_within_the_picture_are_drawn(tmp_path: Path, drawn: list[Fig
     )
     assert all(band.x0 <= axes.get_xlim()[0] and band.x1 >= axes.get_xlim()[1] for band in bands)
     without = dataclasses.replace(scene, lanes=None, lane_mask=None)
-    highway_scene(without, forecast(scene), tmp_path / "without.png")
+    draw(without, forecast(scene), tmp_path / "without.png")
     assert not [patch for patch in drawn[1].axes[0].patches if isinstance(patch, PathPatch)]
 
 
 def test_equal_forecasts_give_equal_bytes_and_others_do_not(tmp_path: Path) -> None:
     scene, size = traffic(), mpl.rcParams["font.size"]
     predicted = forecast(scene)
-    first, second = (highway_scene(scene, predicted, tmp_path / name) for name in ("a.png", "b.png"))
+    first, second = (draw(scene, predicted, tmp_path / name) for name in ("a.png", "b.png"))
     assert first.read_bytes() == second.read_bytes()
     states = predicted.states.clone()
     states[:, 1, 2, 5:, 1] += 1.0
-    other = highway_scene(scene, dataclasses.replace(predicted, states=states), tmp_path / "c.png")
+    other = draw(scene, dataclasses.replace(predicted, states=states), tmp_path / "c.png")
     assert pixels(other).shape == pixels(first).shape
     assert not np.array_equal(pixels(other), pixels(first))
     assert mpl.rcParams["font.size"] == size
@@ -174,9 +174,9 @@ def test_masked_values_are_not_drawn(tmp_path: Path) -> None:
             lanes=scene.lanes.masked_fill(hidden[..., None], garbage),
             lane_mask=~hidden,
         )
-        written.append(highway_scene(masked, predicted, tmp_path / "masked.png").read_bytes())
+        written.append(draw(masked, predicted, tmp_path / "masked.png").read_bytes())
     assert written[0] == written[1]
-    assert written[0] != highway_scene(traffic(), forecast(traffic()), tmp_path / "whole.png").read_bytes()
+    assert written[0] != draw(traffic(), forecast(traffic()), tmp_path / "whole.png").read_bytes()
 
 
 def test_unobserved_steps_are_gaps(tmp_path: Path, drawn: list[Figure]) -> None:
@@ -184,7 +184,7 @@ def test_unobserved_steps_are_gaps(tmp_path: Path, drawn: list[Figure]) -> None:
     scene.future_mask[0, 2, 5:8] = False
     scene.future_mask[0, 3, 12:] = False
     scene.future_mask[0, 1] = False
-    highway_scene(scene, forecast(scene), tmp_path / "scene.png")
+    draw(scene, forecast(scene), tmp_path / "scene.png")
     (axes, *_) = drawn[0].axes
     lines = [c.get_segments() for c in axes.collections if to_hex(c.get_colors()[-1]) == TRUTH.lower()]
     assert [len(lines[0]), len(lines[1])] == [STEPS - 1, STEPS - 1 - 4]
@@ -200,13 +200,13 @@ def test_a_forecast_that_is_not_finite_is_noted_in_its_panel(tmp_path: Path, dra
     predicted.states[0, 2, 1, 3] = torch.nan
     predicted.states[0, 1] = torch.inf
     predicted.parameters.goals[0, 2, 1] = torch.nan
-    pixels(highway_scene(scene, predicted, tmp_path / "scene.png"))
+    pixels(draw(scene, predicted, tmp_path / "scene.png"))
     notes = [axes.get_title(loc="right") for axes in drawn[0].axes]
     assert notes == ["not finite: 2 van", "the forecast is not finite", ""]
     nothing = dataclasses.replace(
         predicted, states=predicted.states * torch.nan, probabilities=torch.full((1, 3), torch.nan)
     )
-    pixels(highway_scene(scene, nothing, tmp_path / "nothing.png"))
+    pixels(draw(scene, nothing, tmp_path / "nothing.png"))
     assert all(np.isfinite(axes.get_xlim() + axes.get_ylim()).all() for axes in drawn[1].axes)
 
 
@@ -214,7 +214,7 @@ def test_a_diverging_forecast_does_not_enlarge_the_picture(tmp_path: Path, drawn
     scene = traffic()
     predicted = forecast(scene)
     predicted.states[0, 0, 1] *= 1e7
-    path = highway_scene(scene, predicted, tmp_path / "scene.png")
+    path = draw(scene, predicted, tmp_path / "scene.png")
     axes = drawn[0].axes[0]
     assert np.ptp(axes.get_xlim()) <= LONGEST
     assert np.ptp(axes.get_ylim()) < 60
@@ -224,7 +224,7 @@ def test_a_diverging_forecast_does_not_enlarge_the_picture(tmp_path: Path, drawn
 def test_a_scene_without_future_map_and_sizes_is_drawn(tmp_path: Path, drawn: list[Figure]) -> None:
     bare = Scene(traffic().history, DT)
     predicted = JointForecast(forecast(traffic(), modes=1).states, torch.ones(1, 1))
-    pixels(highway_scene(bare, predicted, tmp_path / "scene.png"))
+    pixels(draw(bare, predicted, tmp_path / "scene.png"))
     (axes,) = drawn[0].axes
     assert axes.get_title(loc="left") == "mode 1,  p = 1.00"
     assert not boxes(axes, TRUTH, filled=False)
@@ -242,7 +242,7 @@ def test_pedestrians_are_discs_in_their_own_frame(tmp_path: Path, drawn: list[Fi
         size=torch.full((1, 2, 2), 0.5),
         kind=torch.full((1, 2), KINDS.index("pedestrian")),
     )
-    highway_scene(scene, forecast(scene), tmp_path / "scene.png")
+    draw(scene, forecast(scene), tmp_path / "scene.png")
     axes = drawn[0].axes[-1]
     assert axes.get_xlabel() == "x [m]"
     for i in range(2):
@@ -258,7 +258,7 @@ def test_many_agents_and_modes_fit_into_the_picture(tmp_path: Path, drawn: list[
     scene = Scene(
         track[:, :, :HISTORY], DT, future=track[:, :, HISTORY:], size=SIZES[:1].expand(1, many, 2), lanes=road()
     )
-    path = highway_scene(scene, forecast(scene, modes=9), tmp_path / "scene.png")
+    path = draw(scene, forecast(scene, modes=9), tmp_path / "scene.png")
     assert len(drawn[0].axes) == 6
     assert "the 6 most likely of 9 modes" in [text.get_text() for text in drawn[0].texts]
     axes = drawn[0].axes[0]
@@ -273,7 +273,7 @@ def test_a_comparison_has_a_panel_for_each_forecaster(tmp_path: Path, drawn: lis
     scene = traffic()
     row = forecast(scene)
     constant = JointForecast(row.states[:, :1], torch.ones(1, 1))
-    path = highway_comparison(scene, {"Constant velocity": constant, "EPO": row}, tmp_path / "rows.png")
+    path = draw_rows(scene, {"Constant velocity": constant, "EPO": row}, tmp_path / "rows.png")
     assert [a.get_title(loc="left") for a in drawn[0].axes] == ["Constant velocity,  p = 1.00", "EPO,  p = 0.50"]
     ends = []
     for axes in drawn[0].axes:
@@ -288,10 +288,10 @@ def test_missing_forecasts_several_scenes_and_absent_agents_are_refused(tmp_path
     scene = traffic()
     predicted = forecast(scene)
     with pytest.raises(ValueError, match="without forecasts"):
-        highway_comparison(scene, {}, tmp_path / "no.png")
+        draw_rows(scene, {}, tmp_path / "no.png")
     with pytest.raises(ValueError, match="one scene, not 2"):
-        highway_scene(scene[[0, 0]], predicted[[0, 0]], tmp_path / "no.png")
+        draw(scene[[0, 0]], predicted[[0, 0]], tmp_path / "no.png")
     nobody = dataclasses.replace(scene, agent_mask=torch.zeros(1, 4, dtype=torch.bool))
     with pytest.raises(ValueError, match="without an observed agent"):
-        highway_scene(nobody, predicted, tmp_path / "no.png")
+        draw(nobody, predicted, tmp_path / "no.png")
     assert list(tmp_path.iterdir()) == []
