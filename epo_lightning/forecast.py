@@ -66,6 +66,11 @@ class GameParameters(Batch):
             elif value is not None or field.default is dataclasses.MISSING:
                 _check_tensor(name, value)
 
+    def without_pairs(self) -> GameParameters:
+        """The same games with pair weights of zero, in which no agent reacts to another one."""
+        alone = {name: torch.zeros_like(weight) for name, weight in self.pair_weights.items()}
+        return dataclasses.replace(self, pair_weights=alone)
+
     def for_every_mode(self, modes: int) -> GameParameters:
         """The same games for M modes: a single game is repeated for all of them. Initial strategies stay unchanged."""
 

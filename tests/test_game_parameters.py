@@ -65,3 +65,12 @@ def test_a_solver_names_arguments_in_another_order() -> None:
     for wrong, named in (((scene, energy, game), "Scene, FeatureEnergy, GameParameters"), ((energy, {}, game), "dict")):
         with pytest.raises(TypeError, match=f"an energy, a Scene and GameParameters, in this order, not .*{named}"):
             solve(*wrong)
+
+
+def test_games_without_pairs_differ_in_their_pair_weights_alone():
+    game = random_game(random_scene(2, 3))
+    alone = game.without_pairs()
+    assert {name: weight.any().item() for name, weight in alone.pair_weights.items()} == {"proximity": False}
+    assert game.pair_weights["proximity"].all()
+    assert all(torch.equal(alone.own_weights[name], weight) for name, weight in game.own_weights.items())
+    assert alone.initial_controls is game.initial_controls

@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import torch
 import torch.nn.functional as F
@@ -186,17 +186,11 @@ class ForecastPlanner:
         assert isinstance(self.forecaster, EPO)
         assert forecast.parameters is not None
         assert forecast.solution is not None
-        changes: dict[str, Any] = {}
-        if not self.pair_terms:
-            changes["pair_weights"] = {
-                name: torch.zeros_like(weight) for name, weight in forecast.parameters.pair_weights.items()
-            }
+        game = forecast.parameters if self.pair_terms else forecast.parameters.without_pairs()
         if self.warm and previous is not None and previous.joint is not None:
             start = shifted(previous.joint, forecast.solution.controls.shape[-2])
-            changes["initial_controls"] = start.to(forecast.solution.controls)
-        if not changes:
-            return forecast.solution
-        return self.forecaster.solve(scene, dataclasses.replace(forecast.parameters, **changes))
+            game = dataclasses.replace(game, initial_controls=start.to(forecast.solution.controls))
+        return forecast.solution if game is forecast.parameters else self.forecaster.solve(scene, game)
 
     def _mode(self, forecast: JointForecast, states: Tensor, previous: Plan | None) -> Int[Tensor, " B"]:
         if not self.keep or previous is None:

@@ -365,9 +365,7 @@ class EPO(GameForecaster):
             or TABLES in self.solver.provides
         ):
             return None
-        alone = {name: torch.zeros_like(weight) for name, weight in parameters.pair_weights.items()}
-        without = dataclasses.replace(parameters, pair_weights=alone)
-        return self.solve(scene, without).states[..., : self.task.horizon, :]
+        return self.solve(scene, parameters.without_pairs()).states[..., : self.task.horizon, :]
 
     def solve(self, scene: Scene, parameters: GameParameters) -> Solution:
         """The solution of a given game of a scene, for example an inferred one with other weights or goals."""
