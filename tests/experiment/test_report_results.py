@@ -16,6 +16,7 @@ from report.test_transfer import three_runs
 
 from epo_lightning.experiment.config.settings import ReportSettings
 from epo_lightning.experiment.report import NOT_DRAWN, report
+from epo_lightning.files import write_json
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.results import _digest, save_results
 from epo_lightning.report.write import Report
@@ -33,13 +34,15 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def every_section(runs: Path) -> None:
-    """Rows with seeds and logs, runtimes, and a run without scores; one log and one time are damaged."""
+    """Rows with seeds and logs, runtimes, and a run without scores; two logs and one time are damaged."""
     rows_with_seeds(runs)
     timed(runs / "times", 4, 2, 1, 0.002)
     timed(runs / "times", 4, 2, 8, 0.003)
     make_run(runs / "waiting", "Not evaluated", "marginal", None)
     logless = make_run(runs / "logless", "Without a log", "marginal", scores(0.7))
     write_log(logless, [])
+    unvalidated = make_run(runs / "unvalidated", "Without a validation", "marginal", scores(0.8))
+    write_log(unvalidated, []).write_text("epoch,step,train/loss\n0,99,0.5\n")
     damaged = make_run(runs / "times" / "damaged", "Damaged", "marginal", None)
     damaged.metrics_file("time").write_text("{}")
 
@@ -72,6 +75,7 @@ def test_a_report_is_rebuilt_from_its_results_file() -> None:
     assert "- `runs/waiting`: interrupted" in written
     assert "times/damaged/runtime.json is not what" in written
     assert "logless/logs/metrics.csv is missing or has no row" in two["index.html"].decode()
+    assert "unvalidated/logs/metrics.csv has no finite val/minSADE" in two["index.html"].decode()
 
 
 def test_a_timed_run_with_a_damaged_record_is_noted() -> None:
@@ -155,6 +159,17 @@ def test_every_number_has_its_command_commit_seed_and_data_and_no_folder_of_the_
     assert entry["config"]["seed"] == 4
     assert entry["scores"]["metrics.json"] == {"data_digest": "abc", "split": "test", "metrics": scores(0.3)}
     assert str(tmp_path) not in json.dumps(content)
+
+
+def test_a_secret_that_an_older_version_recorded_is_in_no_results_file_and_no_table() -> None:
+    run = make_run(Path("runs/a"), "V-LSTM", "marginal", scores(0.3))
+    command = "epo train logger.mlflow.uri=https://me:pa55word@host/mlflow"
+    write_json(run.record_file, {**run.record, "command": command})
+    file = saved()
+    assert "https://me:***@host/mlflow" in file.read_text()
+    assert "https://me:***@host/mlflow" in Path("one/results.md").read_text()
+    written = {**files(Path("one")), **rebuilt(file), "file": file.read_bytes()}
+    assert [name for name, content in written.items() if b"pa55word" in content] == []
 
 
 def edited(text: str) -> str:

@@ -274,3 +274,11 @@ def test_runs_whose_code_was_not_recorded_are_told_apart_by_their_commits() -> N
     assert of_different_code([row("A", (0, "x", "1" * 40), (1, "x", "2" * 40)), row("B", (0, "x", "3" * 40))]) == []
     (note,) = of_different_code([row("A", (0, "", "1" * 40), (1, "x", "2" * 40)), row("B", (0, "x", "2" * 40))])
     assert "A (seed 0) at commit 1111111, whose code was not recorded; A (seed 1), B (seed 0). To train" in note
+
+
+def test_a_baseline_that_learned_nothing_is_not_said_to_have_other_code(tmp_path: Path) -> None:
+    for name, forecaster, code in (("SC", "scene_consistent", "one"), ("CV", "constant_velocity", "two")):
+        make_run(tmp_path / name, name, forecaster, scores(0.1)).update(versions={"code": code})
+    rows = list(rows_of(tmp_path).values())
+    assert {run.code for row in rows for run in row.runs} == {"one", "two"}
+    assert of_different_code(rows) == []

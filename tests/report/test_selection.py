@@ -213,3 +213,11 @@ def test_a_damaged_command_is_named_with_its_file(tmp_path: Path) -> None:
     searched(tmp_path, "experiment=rpi/v_lstm 'title=x")
     with pytest.raises(ConfigError, match=r"0\.002/run\.json: command cannot be read \(No closing quotation\)"):
         best(tmp_path)
+
+
+def test_of_settings_with_equal_scores_the_smallest_number_wins(tmp_path: Path) -> None:
+    for size in (16, 8, 128):
+        settings = {"data.batch_size": size}
+        make_run(tmp_path / str(size), "V-LSTM", "marginal", scores(0.2), split="val", settings=settings)
+    (found,) = best(tmp_path)
+    assert found.overrides == ("data.batch_size=8",)

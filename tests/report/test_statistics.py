@@ -169,3 +169,20 @@ def test_rows_with_other_powers_of_the_loss_are_no_pair(tmp_path: Path) -> None:
 def test_without_a_pair_there_is_no_comparison(tmp_path: Path) -> None:
     make_run(tmp_path / "a", "V-LSTM + EPO", "epo", scores(0.1))
     assert build_comparisons(build_tables(collect(tmp_path))) == []
+
+
+def test_tables_of_subsets_and_stages_have_no_comparisons_of_their_own(tmp_path: Path) -> None:
+    for title, forecaster, value in (("SC", "scene_consistent", 0.2), ("EPO", "epo", 0.1)):
+        of_subset = {"executed/minSADE": value, "executed/minSFDE": value}
+        make_run(tmp_path / title, title, forecaster, scores(value) | of_subset)
+    tables = build_tables(collect(tmp_path))
+    assert [table.main for table in tables] == [True, False]
+    assert [found.title for found in build_comparisons(tables)] == ["rpi, test split: +EPO against +SC, seed by seed"]
+
+
+def test_a_metric_that_one_of_two_rows_lacks_is_not_compared(tmp_path: Path) -> None:
+    without = {name: value for name, value in scores(0.2).items() if name != "overlap_authors"}
+    make_run(tmp_path / "sc", "SC", "scene_consistent", without)
+    make_run(tmp_path / "epo", "EPO", "epo", scores(0.1))
+    ((pair,),) = (found.pairs for found in build_comparisons(build_tables(collect(tmp_path))))
+    assert set(pair.differences) == set(without)

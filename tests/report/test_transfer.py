@@ -144,6 +144,13 @@ def test_players_of_games_are_told_apart_by_their_settings(tmp_path: Path) -> No
     assert sheet.header[4:] == ("rpi_hard, test", "rpi_hard, feedback players, test")
 
 
+def test_a_test_is_not_named_after_a_share_of_games_that_only_a_training_has(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "sc", "SC", "scene_consistent", None, data="a", digest="A")
+    on(run, "rpi", 2.0, split="test", settings={"name": "rpi", "games_share": 0.25})
+    (sheet, *_) = transfer_sheets(transfers([run]))
+    assert sheet.header[3:] == ("rpi, test",)
+
+
 def test_rows_of_several_data_sets_share_the_columns_of_the_same_scenes(tmp_path: Path) -> None:
     one = make_run(tmp_path / "one", "SC", "scene_consistent", scores(1.0), data="a", digest="A")
     other = make_run(tmp_path / "other", "SC", "scene_consistent", scores(2.0), data="b", digest="B")
