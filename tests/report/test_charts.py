@@ -124,6 +124,16 @@ def test_rows_that_differ_in_more_than_steps_are_not_joined(tmp_path: Path) -> N
     assert steps_curves(distinct(build_tables(collect(tmp_path)))) == []
 
 
+def test_rows_on_two_splits_have_curves_apart(tmp_path: Path) -> None:
+    for steps, value in ((1, 0.3), (2, 0.2)):
+        for split, more in (("test", 0.0), ("val", 0.5)):
+            path, settings = tmp_path / str(steps), {"solver.steps": steps}
+            make_run(path, "V-LSTM + EPO", "epo", scores(value + more), split=split, settings=settings)
+    curves = steps_curves(distinct(build_tables(collect(tmp_path))))
+    means = {curve.split: curve.optimised.mean for curve in curves}
+    assert means == {"rpi, test split": (0.3, 0.2), "rpi, val split": (0.8, 0.7)}
+
+
 def test_data_efficiency_joins_rows_that_differ_only_in_the_share_of_the_games(tmp_path: Path) -> None:
     values = {("V-LSTM + SC", None): 0.02, ("V-LSTM + SC", 0.1): 0.04, ("V-LSTM + SC", 0.01): 0.2, ("Other", 0.1): 0.5}
     for (title, share), value in values.items():
@@ -144,6 +154,18 @@ def test_data_efficiency_joins_rows_that_differ_only_in_the_share_of_the_games(t
     assert chart.numbers[0] == ("V-LSTM + SC", "1 %", "2", "0.20500")
     drawn = lines(draw_efficiency(entry.curves))
     assert drawn == {"row0-line": list(zip(curve.x, curve.mean, strict=True))}
+
+
+def test_data_efficiency_is_that_of_trained_rows_on_one_split(tmp_path: Path) -> None:
+    for share, value in ((0.1, 0.4), (1.0, 0.2)):
+        settings = {"data.games_share": share}
+        for split, more in (("test", 0.0), ("val", 0.5)):
+            path = tmp_path / f"sc-{share}"
+            make_run(path, "SC", "scene_consistent", scores(value + more), split=split, settings=settings)
+        make_run(tmp_path / f"cv-{share}", "CV", "constant_velocity", scores(0.9), settings=settings)
+    found = efficiencies(distinct(build_tables(collect(tmp_path))))
+    means = {entry.data: [(curve.name, curve.mean) for curve in entry.curves] for entry in found}
+    assert means == {"rpi, test split": [("SC", (0.4, 0.2))], "rpi, val split": [("SC", (0.9, 0.7))]}
 
 
 def test_the_heat_map_shows_every_timing_and_the_papers(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from epo_lightning.registry import ConfigError
-from epo_lightning.report.closed_loop import read_closed_loop
+from epo_lightning.report.closed_loop import measures_table, read_closed_loop
 from epo_lightning.report.template import write_page
 
 FIRST, SECOND = "V-LSTM + EPO", "true game"
@@ -70,6 +70,18 @@ def test_a_page_shows_estimates_differences_and_times(file: Path, tmp_path: Path
             "0123456",
         ]
     )
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [
+        ((-150.25, -201.0, -99.4), "-150 (-201 to -99)"),
+        ((-1.5, -2.0, -1.0), "-1.50 (-2.00 to -1.00)"),
+        ((-0.1, -0.2, 0.0), "-0.100 (-0.200 to 0.000)"),
+    ],
+)
+def test_negative_differences_have_the_decimals_of_positive_ones(values: tuple[float, float, float], text: str) -> None:
+    assert measures_table({"a": {"cost": estimate(*values)}}, {}, ["cost"]).endswith(f"| a | {text} |")
 
 
 def test_names_that_are_not_there_are_refused(file: Path) -> None:

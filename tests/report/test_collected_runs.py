@@ -16,6 +16,7 @@ from rich.console import Console
 from epo_lightning.files import write_json
 from epo_lightning.identity import identity, row_identity
 from epo_lightning.registry import ConfigError
+from epo_lightning.report.folds import named_by_fold
 from epo_lightning.report.notes import of_different_code, untaught
 from epo_lightning.report.rows import Row
 from epo_lightning.report.runs import collect, find_runs
@@ -120,6 +121,11 @@ COPY = r"copy the run folder again"
         ("config.yaml", b"title: \xff", f"config.yaml is not YAML.*{COPY}"),
         (
             "config.yaml",
+            "title: x\nseed: true",
+            f"config.yaml is damaged: its entry seed must be a whole number, not True.*{COPY}",
+        ),
+        (
+            "config.yaml",
             "title: x\nenergy: 5",
             f"config.yaml is damaged: its entry energy must be an object with a text `name`, .*{COPY}",
         ),
@@ -213,6 +219,12 @@ def test_runs_that_were_tested_on_other_recordings_are_in_tables_of_their_own(tm
     shutil.rmtree(tmp_path / "epo1")
     shutil.rmtree(tmp_path / "scene_consistent1")
     assert {table.data for table in build_tables(collect(tmp_path))} == {"square"}, "one test split needs no name"
+
+
+def test_the_order_of_the_groups_of_a_test_split_makes_no_other_split(tmp_path: Path) -> None:
+    for title, test in (("SC", ["a", "b"]), ("EPO", ["b", "a"])):
+        make_run(tmp_path / title, title, "epo", scores(0.1), data="square", settings={"data.test": test})
+    assert [named.data for named in named_by_fold(collect(tmp_path))] == ["square", "square"]
 
 
 def test_over_folds_rows_are_those_of_equal_settings(tmp_path: Path) -> None:

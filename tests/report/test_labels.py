@@ -96,6 +96,8 @@ def test_labels_round_numbers_unless_that_makes_them_equal() -> None:
 
 def test_rows_with_too_long_labels_are_named_by_their_parts_or_their_identity() -> None:
     rows = ["0123456789abcdef", "fedcba9876543210"]
+    four = [{f"solver.k{number}": number + row for number in range(4)} for row in range(2)]
+    assert labels("V", four, CONFIG, rows) == ["V, k0=0, k1=1, k2=2, k3=3", "V, k0=1, k1=2, k2=3, k3=4"]
     many = [{f"solver.k{number}": number + row for number in range(5)} for row in range(2)]
     assert labels("V", many, CONFIG, rows) == ["V, row 01234567", "V, row fedcba98"]
     parts = [{**entry, "backbone.name": name} for entry, name in zip(many, ("v_lstm", "vibes"), strict=True)]

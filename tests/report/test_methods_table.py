@@ -15,6 +15,7 @@ from epo_lightning.report.charts import charts_of
 from epo_lightning.report.columns import Column, significant
 from epo_lightning.report.costs import cost_sheets, last_fifth
 from epo_lightning.report.latex import to_latex
+from epo_lightning.report.made import how_made
 from epo_lightning.report.paper import is_papers
 from epo_lightning.report.render import legend, to_markdown
 from epo_lightning.report.runs import collect, find_runs
@@ -271,6 +272,19 @@ def test_runs_of_several_methods_that_were_only_timed_are_named(tmp_path: Path) 
     ]
 
 
+def test_runs_that_were_scored_and_timed_are_made_once(tmp_path: Path) -> None:
+    of_methods(tmp_path)
+    made = how_made(build_tables(collect(tmp_path)), read_timings(find_runs(tmp_path))[0])
+    assert sorted((row.name, row.seeds) for row in made) == [("EPO", "0, 1"), ("JFP", "0, 1"), ("Laplace", "0, 1")]
+
+
+def test_runs_that_were_only_timed_are_in_the_order_of_their_seeds(tmp_path: Path) -> None:
+    for path, seed in (("a", 10), ("b", 2)):
+        time_it(make_run(tmp_path / path, "EPO", "epo", None, seed=seed), 0.002)
+    (row,) = how_made([], read_timings(find_runs(tmp_path))[0])
+    assert (row.what, row.seeds) == ("rpi, runtime", "2, 10")
+
+
 def test_runtime_figures_show_one_method_each(tmp_path: Path) -> None:
     for agents in (2, 4):
         timed(tmp_path / "ours", agents, 2, 4, 0.001 * agents)
@@ -283,12 +297,21 @@ def test_runtime_figures_show_one_method_each(tmp_path: Path) -> None:
     assert [line[:4] for line in chart.numbers] == [("2", "2", "4", "2.0 ms"), ("4", "2", "4", "4.0 ms")]
 
 
+def test_a_forecaster_without_a_game_is_in_the_runtime_figure_of_every_method(tmp_path: Path) -> None:
+    timed(tmp_path, 2, 2, 4, 0.002)
+    timed(tmp_path, 2, None, 4, 0.001)
+    (chart,) = charts_of([], read_timings(find_runs(tmp_path))[0])
+    assert [line[:4] for line in chart.numbers] == [("2", "-", "4", "1.0 ms"), ("2", "2", "4", "2.0 ms")]
+
+
 def test_durations_have_a_suitable_unit() -> None:
-    assert [duration_text(value) for value in (0.4, 75, 119.4, 720, 11400)] == [
+    assert [duration_text(value) for value in (0.4, 75, 119.4, 179, 720, 7199, 11400)] == [
         "0 s",
         "75 s",
         "119 s",
+        "3 min",
         "12 min",
+        "2 h 0 min",
         "3 h 10 min",
     ]
 

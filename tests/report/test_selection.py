@@ -130,7 +130,7 @@ def test_a_metric_that_was_not_scored_is_named(tmp_path: Path) -> None:
 
 
 def test_settings_of_other_budgets_are_not_compared(tmp_path: Path) -> None:
-    search(tmp_path, {(0.1, 64): [0.3]})
+    search(tmp_path, {(0.1, 64): [0.3, 0.3]})
     make_run(tmp_path / "long", "V-LSTM", "marginal", scores(0.1), split="val", budget="long", experiment="rpi/v_lstm")
     with pytest.raises(ConfigError, match=r"differ in budget \(long: V-LSTM; reduced: V-LSTM\)") as refused:
         best(tmp_path)

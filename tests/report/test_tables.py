@@ -115,6 +115,13 @@ def test_the_paper_has_no_values_of_games_without_pair_terms_or_with_other_parts
     assert known == {"paper": True, "no pair": False, "another": False}
 
 
+def test_an_ablation_has_the_papers_values_of_its_own_and_not_those_of_the_main_row(tmp_path: Path) -> None:
+    for experiment in ("exid/v_lstm_epo", "exid/v_lstm_epo_no_init"):
+        make_run(tmp_path / experiment, experiment, "epo", scores(0.9), data="exid", experiment=experiment)
+    papers = {name: row.cells["minADE"].paper for name, row in rows_of(tmp_path).items()}
+    assert papers == {"exid/v_lstm_epo": 0.80, "exid/v_lstm_epo_no_init": 0.89}
+
+
 def test_equal_printed_values_have_equal_ranks(tmp_path: Path) -> None:
     for name, value in (("a", 0.10001), ("b", 0.10002), ("c", 0.2), ("d", math.nan)):
         make_run(tmp_path / name, name, "epo", scores(value))

@@ -156,10 +156,12 @@ def test_rows_of_several_data_sets_share_the_columns_of_the_same_scenes(tmp_path
     other = make_run(tmp_path / "other", "SC", "scene_consistent", scores(2.0), data="b", digest="B")
     on(one, "b", 3.0, split="test", data_digest="B")
     on(other, "a", 4.0, split="test", data_digest="A")
-    sheet = transfer_sheets(transfers([one, other]))[0]
+    sheet, *_, tests = transfer_sheets(transfers([one, other]))
     assert sheet.header[3:] == ("a, test", "b, test")
     assert [line[0] for line in sheet.lines] == ["a", "b"]
     assert [line[3:] for line in sheet.lines] == [("1.000", "3.000"), ("4.000", "2.000")]
+    counts = {line[0]: line[3:] for line in tests.lines}
+    assert counts == dict.fromkeys(("a, test", "b, test"), ("12", "3")), "known from the run that was trained elsewhere"
 
 
 def test_rows_of_different_data_keep_their_titles(tmp_path: Path) -> None:
@@ -203,6 +205,14 @@ def test_of_two_versions_the_later_one_counts_and_checkpoints_have_lines_of_thei
     on(one, "b", 8.0, checkpoint="last", name="-last")
     sheet = transfer_sheets(transfers([one]))[0]
     assert sheet.lines == (("a", "SC", "1", "5.000"), ("a", "SC, checkpoint last", "1", "8.000"))
+
+
+def test_a_baseline_that_learned_nothing_has_one_line_whatever_its_checkpoint(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "cv", "Const. Vel.", "constant_velocity", None, data="a")
+    on(run, "b", 3.0)
+    on(run, "c", 4.0, checkpoint="last")
+    sheet = transfer_sheets(transfers([run]))[0]
+    assert sheet.lines == (("-", "Const. Vel.", "1", "3.000", "4.000"),)
 
 
 @pytest.mark.parametrize(
