@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -245,6 +246,7 @@ def test_a_damaged_or_foreign_file_is_refused(change: Callable[[str], str], mess
         ("runs.0.record.git_commit", 5, r"its entry git_commit must be a text, or null, not 5"),
         ("runs.0.record.steps", "many", r"its entry steps must be a whole number, or null, not 'many'"),
         ("runs.0.record.seconds", "x", r"its entry seconds must be a finite number, or null, not 'x'"),
+        ("runs.0.record.seconds", math.nan, r"its entry seconds must be a finite number, or null, not nan"),
         ("runs.0.record.status", [], r"its entry status must be a text, not \[\]"),
         (
             "runs.0.config.backbone",
