@@ -58,6 +58,16 @@ def test_runs_on_cpu_take_no_gpu() -> None:
         assert devices == 3
 
 
+def test_a_run_on_several_gpus_takes_no_single_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail() -> int:
+        raise AssertionError("one of these GPUs is chosen")
+
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    monkeypatch.setattr("torch.cuda.device_count", fail)
+    with placed(TrainerSettings(accelerator="gpu", devices=2)) as devices:
+        assert devices == 2
+
+
 @pytest.mark.parametrize("cuda", [False, True])
 def test_gpus_are_those_of_cuda(cuda: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Lightning would also take Apple's, which cannot sum scores in float64."""

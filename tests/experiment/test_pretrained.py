@@ -13,6 +13,7 @@ from safetensors.torch import load_file
 
 import epo_lightning
 from epo_lightning import pretrained
+from epo_lightning.data.cache import file_digest
 from epo_lightning.experiment import ship as shipping
 from epo_lightning.experiment.card import SCORES, Recipe, card, recipe_of, recipes
 from epo_lightning.experiment.config.compose import compose
@@ -177,10 +178,32 @@ def test_a_packed_run_forecasts_like_the_run(
     # Larger weights are stored in half precision, and the scores are those of the stored weights.
     monkeypatch.setattr(shipping, "LARGEST", 1000)
     folder = ship(RunFolder.open("one"), "tiny/sc", EXAMPLE, tmp_path / "packed")
+    assert not list(tmp_path.glob(".packed*")), "nothing is left of the forecaster that was replaced"
+    assert read_json(folder / "run.json")["sha256"] == file_digest(folder / "checkpoints" / "best.ckpt")
     assert "stored as float16" in pretrained.card(folder)
     half = epo_lightning.load(folder / "checkpoints" / "best.ckpt").predict(scenes).states
     assert 0 < float((half - one.predict(scenes).states).abs().max()) < 0.05
     assert read_json(folder / "metrics.json")["metrics"]["minSADE"] != scores[0]
+
+
+def test_a_forecaster_that_cannot_be_replaced_is_kept(
+    epo: Epo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert epo("train", "experiment=rpi/v_lstm_sc", *TINY, "run_dir=one") == 0
+    (tmp_path / "packed").mkdir()
+    (tmp_path / "packed" / "card.md").write_text("the earlier one")
+    rename = Path.rename
+
+    def stop(self: Path, target: Path) -> Path:
+        if self.name == ".packed-new":
+            raise KeyboardInterrupt
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", stop)
+    with pytest.raises(KeyboardInterrupt):
+        ship(RunFolder.open("one"), "tiny/sc", EXAMPLE, tmp_path / "packed")
+    (kept,) = tmp_path.glob(".packed-old/card.md")
+    assert kept.read_text() == "the earlier one"
 
 
 def test_an_unfinished_run_is_not_packed(tmp_path: Path) -> None:

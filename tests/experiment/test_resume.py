@@ -282,4 +282,5 @@ def test_a_full_disk_is_named_and_the_run_can_continue_later(epo: Epo, capsys: p
     assert "File too large" in run.record["error"]
     assert not list(run.checkpoints.iterdir())
     assert epo("train", "resume=parts") == 0
+    assert run.record["error"] is None
     assert same("whole", "parts")

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -18,7 +20,7 @@ import epo_lightning
 from epo_lightning.experiment import evaluate
 from epo_lightning.files import write_json
 from epo_lightning.forecasters.checkpoint import read_checkpoint
-from epo_lightning.identity import identity
+from epo_lightning.identity import identity, row_identity
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder
 from epo_lightning.solvers.gauss_newton.kernel import interface
@@ -55,6 +57,17 @@ def test_a_missing_folder_is_answered_by_the_one_beside_it_with_a_similar_name(
         assert "did you mean" not in refused("evaluate", f"run={nothing}").partition("The folder")[0]
 
 
+@pytest.fixture
+def in_japan(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A machine whose clock shows another time than UTC."""
+    with monkeypatch.context() as patch:
+        patch.setenv("TZ", "JST-9")
+        time.tzset()
+        yield
+    time.tzset()
+
+
+@pytest.mark.usefixtures("in_japan")
 def test_a_run_folder_holds_what_a_run_needs(epo: Epo) -> None:
     assert epo("train", ROW, *TINY, "run_dir=run", "seed=3") == 0
     run = RunFolder.open("run")
@@ -62,6 +75,10 @@ def test_a_run_folder_holds_what_a_run_needs(epo: Epo) -> None:
     assert record["status"] == "finished"
     assert record["seed"] == config["seed"] == 3
     assert record["data_digest"] == "tiny-64-0"
+    assert record["identity"] == identity(config, "tiny-64-0")
+    assert record["row"] == row_identity(config, "tiny-64-0") == row_identity({**config, "seed": 4}, "tiny-64-0")
+    began = datetime.strptime(record["began"], "%Y-%m-%dT%H:%M:%SZ").replace(tzinfo=UTC)
+    assert abs((datetime.now(UTC) - began).total_seconds()) < 3600
     assert record["versions"]["torch"]
     assert bool(record["versions"]["compiled layer"]) == (not isinstance(interface.find(), str))
     assert record["parameters"] > 0
@@ -70,6 +87,7 @@ def test_a_run_folder_holds_what_a_run_needs(epo: Epo) -> None:
     assert run.checkpoint("best").is_file()
     assert run.checkpoint("last").is_file()
     assert not run.metrics_file().exists(), "the test split is nobody's business while training"
+    assert not run.progress_file.exists(), "nobody works on it any more"
     assert "run_dir" in yaml.safe_load(run.config_file.read_text())
 
 

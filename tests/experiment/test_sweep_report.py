@@ -13,7 +13,7 @@ from report.run_folders import make_run, scores
 from epo_lightning.experiment.config.settings import ReportSettings
 from epo_lightning.experiment.report import of_sweep, report
 from epo_lightning.experiment.sweeps.sweep import Sweep
-from epo_lightning.experiment.sweeps.watch import status
+from epo_lightning.experiment.sweeps.watch import result, status
 from epo_lightning.files import write_file, write_json
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder
@@ -61,6 +61,15 @@ def test_the_status_of_a_sweep_says_how_to_continue(runs: Path, capsys: pytest.C
     assert hint not in capsys.readouterr().out, "the sweep runs"
 
 
+def test_a_trained_run_is_running_while_it_is_scored(runs: Path) -> None:
+    run = finish(make_run(runs / "a", "V-LSTM", "marginal", None))
+    sweep = begin(runs, "rpi_main", {"a": None})
+    (job,) = sweep.jobs
+    with run.lock():
+        assert sweep.state(job) == "running"
+    assert sweep.state(job) == "trained, not scored"
+
+
 def test_a_sweep_reports_its_runs_and_the_states_of_the_others(runs: Path) -> None:
     finish(make_run(runs / "a", "V-LSTM", "marginal", scores(0.3), seed=0))
     finish(make_run(runs / "b", "V-LSTM", "marginal", scores(0.5), seed=1))
@@ -101,8 +110,9 @@ def test_scores_on_another_split_are_left_out(runs: Path) -> None:
 
 def test_a_sweep_that_measures_time_is_reported(runs: Path) -> None:
     finish(timed(runs, 2, 1, 4, 0.001))
-    finish(timed(runs, 4, 1, 4, 0.002))
-    begin(runs, "runtime", {"N2-S1-M4": None, "N4-S1-M4": None}, score="time")
+    finish(timed(runs, 4, 1, 4, 0.02))
+    sweep = begin(runs, "runtime", {"N2-S1-M4": None, "N4-S1-M4": None}, score="time")
+    assert [result(job) for job in sweep.jobs] == ["1.0 ms per forecast", "19.6 ms per forecast"], "the median"
     out = report(ReportSettings(sweep="runtime", out="out"))
     assert out == Path("out")
     assert (out / "figures" / "runtime.png").is_file()

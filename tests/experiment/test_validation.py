@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -138,6 +139,29 @@ def test_a_long_scoring_says_how_far_it_is(capsys: pytest.CaptureFixture[str], m
         "20 of 50 scenes scored, about 60 s left",
         "40 of 50 scenes scored, about 20 s left",
     ]
+
+
+def test_the_progress_of_a_continued_run_says_from_which_step_it_went_on(tmp_path: Path) -> None:
+    trainer: Any = SimpleNamespace(global_step=40, estimated_stepping_batches=100.0, max_steps=-1)
+    run, often, seldom = RunFolder(tmp_path), callbacks.Progress(RunFolder(tmp_path), every=0.0), math.inf
+    often.on_train_batch_end(trainer)
+    assert not run.progress, "the training has not begun"
+    often.on_train_start(trainer, trainer)
+    trainer.global_step = 41
+    often.on_train_batch_end(trainer)
+    assert {key: run.progress[key] for key in ("step", "from_step", "steps")} == {
+        "step": 41,
+        "from_step": 40,
+        "steps": 100,
+    }
+    rarely = callbacks.Progress(run, every=seldom)
+    trainer.estimated_stepping_batches = math.inf
+    rarely.on_train_start(trainer, trainer)
+    assert (run.progress["from_step"], run.progress["steps"]) == (41, None)
+    trainer.global_step = 42
+    rarely.on_train_batch_end(trainer)
+    rarely.on_validation_batch_end(trainer)
+    assert run.progress["step"] == 41, "the file is written every few seconds"
 
 
 def test_a_training_that_is_shorter_than_the_steps_between_validations_is_validated_at_its_end(epo: Epo) -> None:
