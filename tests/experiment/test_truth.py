@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -11,7 +13,7 @@ import torch
 from epo_lightning.experiment import truth
 from epo_lightning.experiment.evaluate import keep
 from epo_lightning.files import read_json, write_json
-from epo_lightning.forecast import GameParameters
+from epo_lightning.forecast import GameParameters, JointForecast
 from epo_lightning.run_folder import RunFolder
 
 
@@ -108,3 +110,25 @@ def test_only_equal_scores_of_the_same_data_share_a_file(tmp_path: Path) -> None
     write_json(first, {**scored, "metrics": metrics, "truth": {"pair_error": None}})  # damaged: written again
     assert keep(run, {**scored, "metrics": metrics}, checkpoint) == first
     assert "truth" not in read_json(first)
+
+
+def test_every_record_counts_once_with_the_weight_of_its_own_game() -> None:
+    """Scenes of an executed and an alternative future, in another order than the records of the split."""
+    weights = torch.tensor([10.0, 40.0, 90.0, 160.0])
+    records, subset = torch.tensor([3, 3, 0, 0, 2]), torch.tensor([0, 1, 1, 0, 0])
+    inferred = torch.where(subset == 0, weights[records], 1000.0).double()
+    forecast = JointForecast(
+        states=torch.zeros(5, 2, 2, 4, 4),
+        probabilities=torch.tensor([0.25, 0.75]).expand(5, 2),
+        parameters=games(inferred, torch.ones(5).double()),
+    )
+    scene: Any = SimpleNamespace(id=records, subset=subset)
+    collected = truth.TruthTest(weights)
+    for part in (slice(0, 3), slice(3, 5)):
+        batch: Any = SimpleNamespace(id=scene.id[part], subset=scene.subset[part])
+        collected.on_test_batch_end(scene, scene, {"forecast": forecast[part]}, batch, 0)
+    found = torch.cat([batch["true"] for batch in collected._batches])
+    assert found.tolist() == [160.0, 10.0, 90.0]
+    assert collected.scores()["pair_error"] == pytest.approx(0.0, abs=1e-12)
+    assert collected.scores()["pair_rank"] == pytest.approx(1.0)
+    assert truth.TruthTest(weights).scores() == {}
