@@ -158,6 +158,17 @@ def test_the_module_and_its_scene_are_named() -> None:
     assert f"step 0: backbone.to_graph (Linear) returns nan; scenes of the training split: {ids[0]};" in message
 
 
+def test_all_scenes_are_named_where_the_rows_of_an_output_are_no_scenes() -> None:
+    ids: list[int] = []
+
+    def break_all(forecaster: Forecaster, batches: list[Scene]) -> None:
+        forecaster.backbone.to_graph.register_forward_hook(lambda *_: torch.full((3, 5), torch.nan))
+        ids.extend(map(int, batches[0].id))
+
+    message = watched(break_all)
+    assert f"returns nan; scenes of the training split: {', '.join(map(str, ids))};" in message
+
+
 def with_term(forecaster: Forecaster, term: Callable[[Tensor], Tensor]) -> None:
     """Add a term to the loss that depends on a parameter."""
     plain, weight = forecaster.losses, forecaster.backbone.to_graph.weight

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -17,14 +17,16 @@ from experiment import pedestrians, tiny
 from experiment.conftest import Epo
 
 from epo_lightning import cli
+from epo_lightning.data.datamodule import SceneDataset
 from epo_lightning.data.recorded import versions
 from epo_lightning.experiment.assembly import build_data
 from epo_lightning.experiment.config.compose import compose
 from epo_lightning.experiment.config.settings import Settings
-from epo_lightning.experiment.other_data import _files, follow
+from epo_lightning.experiment.other_data import OtherData, _files, follow
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder
 from epo_lightning.schema import read
+from epo_lightning.task import Task
 
 SMALL = ("budget=smoke", "callbacks.progress=none")
 ROAD = ("data=drawn", "data.like=highway", "data.scenes=24")
@@ -110,6 +112,7 @@ def test_a_run_of_roads_is_scored_on_pedestrians_without_a_map(
     assert epo("evaluate", f"run={run}", "data=ucy", f"data.folder={folder}", "workers=1", "data.share=0.5") == 0
     (half,) = {*others(run)} - before
     assert content(half)["scenes"] == round(found["scenes"] / 2)
+    assert content(half)["test"] != found["test"], "a report takes scores of one test for those of two versions"
     pedestrians.square(folder, seed=1)  # the recordings have changed
     assert epo("evaluate", f"run={run}", "data=ucy", f"data.folder={folder}", "workers=1") == 0
     assert len(others(run)) == 4
@@ -374,3 +377,15 @@ def test_tiny_data_is_no_recording(epo: Epo, home: Path, refused: Callable[..., 
     message = refused("evaluate", f"run={home / 'rpi' / 'v_lstm_sc'}", "data=tiny")
     assert "is no SceneDataModule" in message
     assert tiny.CONF.is_dir()
+
+
+@pytest.mark.parametrize("other", [{"digest": "b"}, {"share": 0.5}, {"task": Task(20, 0.2, shape="box")}])
+def test_scenes_their_share_and_the_outline_of_agents_make_another_test(other: dict[str, Any]) -> None:
+    """A report takes scores of one test and checkpoint for those of two versions."""
+    plain = {"digest": "a", "share": 1.0, "task": Task(20, 0.2, shape="disc")}
+    one, two = (
+        OtherData("data", "test", SimpleNamespace(**of), cast(SceneDataset, ()), {}, ())
+        for of in (plain, plain | other)
+    )
+    assert one.test != two.test
+    assert replace(one, split="val").test != one.test == replace(one, name="b").test

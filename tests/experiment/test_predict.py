@@ -13,8 +13,10 @@ from experiment import tiny
 from PIL import Image
 from torch import Tensor
 
+import epo_lightning
+from epo_lightning import pretrained
 from epo_lightning.data.datamodule import SceneDataModule
-from epo_lightning.experiment.pictures import choose, even, eventful
+from epo_lightning.experiment.pictures import choose, even, eventful, forecast_of
 from epo_lightning.experiment.predict import MEANING
 from epo_lightning.forecast import JointForecast
 from epo_lightning.registry import register
@@ -171,10 +173,18 @@ def test_masked_states_are_no_events() -> None:
     scenes.agent_mask[5, 0] = False
     scenes.future[3, 1] = scenes.future[5, 0] = scenes.history[5, 0] = torch.nan
     scenes.future[5, 0, :, 1] = 1e6
+    scenes.agent_mask[4, 2] = False
+    scenes.future[4, 2, :, 1] = 1e6
     assert eventful(scenes, 1) == [6]
     scenes.future_mask[6, 1, 1:] = False
     scenes.future_mask[1, 0, 10:] = False  # lost in the bend: has moved less than the others, but at no time otherwise
     assert eventful(scenes, 1) == [0]
+
+
+def test_many_scenes_are_forecast_in_batches_and_none_is_lost() -> None:
+    forecaster, scenes = epo_lightning.load("rpi/v_lstm_sc"), pretrained.examples("rpi/v_lstm_sc")
+    whole = forecaster.predict(scenes)
+    torch.testing.assert_close(forecast_of(forecaster, scenes, batch_size=5).states, whole.states)
 
 
 def test_events_of_the_history_count_without_a_future() -> None:
