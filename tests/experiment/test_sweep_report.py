@@ -9,13 +9,15 @@ import pytest
 from report.methods import of_methods
 from report.page_runs import timed
 from report.run_folders import make_run, scores
+from report.test_transfer import on
 
 from epo_lightning.experiment.config.settings import ReportSettings
-from epo_lightning.experiment.report import of_sweep, report
+from epo_lightning.experiment.report import of_sweep, preface, report
 from epo_lightning.experiment.sweeps.sweep import Sweep
 from epo_lightning.experiment.sweeps.watch import result, status
 from epo_lightning.files import write_file, write_json
 from epo_lightning.registry import ConfigError
+from epo_lightning.report.runs import collect
 from epo_lightning.run_folder import RunFolder
 
 
@@ -129,7 +131,9 @@ def test_a_sweep_that_measures_scores_and_time_is_reported(runs: Path) -> None:
     sweep = begin(runs, "table1", dict.fromkeys(folders), score=["test", "time"])
     (runs / "Laplace-s1" / "runtime.json").unlink()
     assert [sweep.state(job) for job in sweep.jobs] == ["done"] * 5 + ["trained, not scored"]
-    assert {run.split for run in of_sweep(sweep).evaluated} == {"test"}
+    subject = of_sweep(sweep)
+    assert {run.split for run in subject.evaluated} == {"test"}
+    assert subject.left_out == (), "the run that lacks its time has scores"
     written = (report(ReportSettings(sweep="table1")) / "results.md").read_text()
     titles = [line for line in written.splitlines() if line.startswith("## ")]
     assert titles == [
@@ -144,6 +148,55 @@ def test_a_sweep_that_measures_scores_and_time_is_reported(runs: Path) -> None:
         "| EPO",
         "| Laplace",
     ]
+
+
+@pytest.mark.parametrize(
+    ("budget", "data", "words", "said"),
+    [
+        ("paper", "rpi", "trainer.threads=4 data.root=/data seed=1 optimizer.lr=0.1", []),
+        (
+            "paper",
+            "rpi",
+            "+data.batch_size=16 trainer.threads=4",
+            ["Budget: paper.", "Changed by hand: `+data.batch_size=16`."],
+        ),
+        (
+            "reduced",
+            "rpi",
+            "trainer.max_steps=9",
+            ["Budget: reduced.", "`trainer.max_steps=9`", "do not reproduce its table"],
+        ),
+        ("reduced", "dut", "", ["Budget: reduced."]),
+    ],
+)
+def test_a_report_says_first_what_differs_from_the_papers_settings(
+    tmp_path: Path, budget: str, data: str, words: str, said: list[str]
+) -> None:
+    command = f"epo train experiment=x {words}"
+    make_run(tmp_path, "V-LSTM", "marginal", scores(0.3), budget=budget, data=data, command=command)
+    text = preface(collect(tmp_path))
+    assert bool(text) == bool(said)
+    assert all(part in text for part in said)
+    assert ("do not reproduce" in text) == (data == "rpi" and bool(said))
+    assert "threads" not in text
+
+
+def test_a_run_that_was_scored_on_other_data_alone_is_reported(runs: Path) -> None:
+    elsewhere = finish(make_run(runs / "a", "V-LSTM", "marginal", None))
+    on(elsewhere, "b", 4.0)
+    subject = of_sweep(begin(runs, "rpi_main", {"a": None}))
+    assert [run.path.name for run in subject.runs] == ["a"]
+    assert (subject.evaluated, subject.left_out) == ((), ())
+
+
+def test_a_run_that_goes_on_after_a_failure_is_left_out_without_its_old_error(runs: Path) -> None:
+    finish(make_run(runs / "a", "V-LSTM", "marginal", scores(0.3)))
+    again = make_run(runs / "b", "V-LSTM", "marginal", None, seed=1)
+    sweep = begin(runs, "rpi_main", {"a": None, "b": None})
+    sweep.fail(again, "ValueError: it broke")
+    assert of_sweep(sweep).left_out == (("runs/b", "failed: ValueError: it broke"),)
+    with again.lock():
+        assert of_sweep(sweep).left_out == (("runs/b", "running"),)
 
 
 def test_sweeps_that_cannot_be_reported_are_refused(runs: Path) -> None:
