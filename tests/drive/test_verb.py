@@ -7,13 +7,17 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from experiment.conftest import epo  # noqa: F401 - a fixture
 
+from epo_lightning.drive.rpi import RPIWorld
+from epo_lightning.drive.worlds import BEST_RESPONSE, JOINT
+from epo_lightning.experiment import drive
 from epo_lightning.experiment.config.settings import DriveSettings
-from epo_lightning.experiment.drive import _titles, folder_of
+from epo_lightning.experiment.drive import ROUNDS, _baseline, _milliseconds, _results, _titles, folder_of
 from epo_lightning.files import read_json
 from epo_lightning.report.closed_loop import read_closed_loop
 from epo_lightning.run_folder import RunFolder
@@ -261,3 +265,39 @@ def test_every_setting_that_decides_on_episodes_has_a_folder_of_its_own() -> Non
     for change in ({"seed": 1}, {"episodes": 7}, {"others": ["ignores"]}, {"run": ["rpi/v_lstm_sc"]}):
         assert folder_of(dataclasses.replace(one, **change)) != folder_of(one)
     assert folder_of(dataclasses.replace(one, out="mine")) == Path("mine")
+
+
+def test_differences_are_those_of_the_first_planner_from_the_others_in_the_same_episodes() -> None:
+    first = {"cost": torch.tensor([1.0, 2.0, 6.0]), "collision": torch.tensor([0.0, 0.0, 1.0])}
+    other = {"cost": torch.tensor([3.0, 3.0, 9.0]), "collision": torch.tensor([1.0, 1.0, 1.0])}
+    found = _results({"a": first, "b": other}, ["collision"])
+    assert list(found["differences"]) == ["a - b"]
+    difference = found["differences"]["a - b"]["cost"]
+    assert difference["mean"] == pytest.approx(-2.0)
+    assert difference["low"] < -2.0 < difference["high"]
+    assert found["planners"]["a"]["cost"]["mean"] == pytest.approx(3.0)
+    assert found["units"]["collision"] == "%"
+
+
+def test_times_of_plans_are_milliseconds_by_the_clock_and_of_the_processor(monkeypatch: pytest.MonkeyPatch) -> None:
+    driven: list[range] = []
+
+    def times(world: object, planner: object, episodes: range) -> tuple[list[float], list[float]]:
+        driven.append(episodes)
+        return [0.001 * number for number in range(101)], [0.002 * number for number in range(101)]
+
+    monkeypatch.setattr(drive, "times", times)
+    world: Any = [0, 1]
+    planner: Any = object()
+    found = _milliseconds(world, "plays", {"the driver of the world": None, "a": planner}, 5, lambda line: None)
+    assert found.keys() == {"a"}
+    assert found["a"] == pytest.approx(
+        {"clock median": 50.0, "clock 99 %": 99.0, "processor median": 100.0, "processor 99 %": 198.0, "plans": 101}
+    )
+    assert driven == [range(2)], "there are no more episodes"
+
+
+def test_one_baseline_iterates_best_responses_and_another_one_solves_the_game() -> None:
+    world = RPIWorld(1, 0, "ignores")
+    planners: list[Any] = [_baseline(name)(world) for name in (BEST_RESPONSE, JOINT)]
+    assert [planner.rounds for planner in planners] == [ROUNDS, None]

@@ -20,6 +20,7 @@ from epo_lightning.report.write import Report
 
 from .run_folders import make_run
 from .run_folders import scores as make_scores
+from .test_transfer import on
 
 RESULTS = Path(__file__).parents[2] / "results"
 
@@ -108,6 +109,30 @@ def test_a_table_has_the_papers_values_beside_its_rows() -> None:
         "| ours | 2 | 1.500 ± .707 | .99 |",
         "| other | 1 | 3.000 |  |",
     ]
+
+
+def test_values_are_in_the_order_of_the_seeds_and_have_a_deviation_where_they_differ() -> None:
+    assert Scores("row", {10: {"x": 2.0}, 2: {"x": 1.0}}).values("x") == [1.0, 2.0]
+    assert Scores("row", {0: {"x": 0.5}, 1: {"x": 0.5}}).text("x") == ".500"
+
+
+def test_a_ratio_is_that_of_the_means_and_equal_pairs_are_not_below() -> None:
+    one, other = Scores("a", {0: {"x": 1.0}, 1: {"x": 3.0}}), Scores("b", {0: {"x": 1.0}, 1: {"x": 4.0}})
+    assert one.over(other, "x") == ".80"
+    assert below([one - other], "x") == "1 of 2"
+
+
+def test_a_page_has_the_scores_on_the_test_split_that_were_written_last_and_the_commits(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "runs" / "a", "SC", "scene_consistent", make_scores(0.5), data="a")
+    make_run(run.path, "SC", "scene_consistent", make_scores(0.25), data="a", split="val")
+    run.update(git_commit="f" * 40 + "+", steps=10)
+    on(run, "b", 3.0)
+    on(run, "b", 4.0, "-2")
+    save_results(Report.of_folder(tmp_path / "runs"), tmp_path / "results" / "file.json")
+    results = Results(tmp_path / "results")
+    assert results.rows("file")["SC"].values("SADE") == [0.5]
+    assert results.transfer("file", "a", "b")["SC"].values("SADE") == [4.0]
+    assert "| fffffff+ | 0 | 1 | 10 |" in results.sources()
 
 
 def cross_validation(folder: Path) -> Path:
