@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -105,6 +106,10 @@ def test_scores_are_never_replaced(epo: Epo, refused: Callable[..., str], capsys
     assert content["checkpoint"] == "last"
     assert content["data_digest"] == run.record["data_digest"]
     assert other.stem.endswith(content["checkpoint_digest"][:8])
+    shutil.copy(run.checkpoint("last"), "kept.ckpt")
+    assert epo("evaluate", "run=run", f"checkpoint={Path('kept.ckpt').resolve()}") == 0
+    (kept,) = run.path.glob("scores-test-kept-*.json")
+    assert json.loads(kept.read_text())["checkpoint"] == "kept.ckpt", "no folder of this machine"
 
     # Another file in the place of the best checkpoint.
     weights = torch.load(run.checkpoint("best"), weights_only=True)

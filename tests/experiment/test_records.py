@@ -6,6 +6,7 @@ import os
 import resource
 import shlex
 import subprocess
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.metadata import EntryPoint
@@ -297,6 +298,12 @@ def test_the_hash_of_the_code_is_that_of_the_files_on_which_results_depend(
     assert provenance.code.__wrapped__() == hashes[-1]
 
 
+def test_runs_whose_code_was_not_recorded_count_as_runs_of_the_present_code() -> None:
+    for record in ({}, {"versions": None}, {"versions": {"torch": "2.7"}}, {"versions": {"code": provenance.code()}}):
+        assert not provenance.of_other_code(record)
+    assert provenance.of_other_code({"versions": {"code": "another"}})
+
+
 def test_runs_of_other_code_are_pointed_out(
     epo: Epo, refused: Callable[..., str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -323,6 +330,9 @@ def test_runs_of_other_code_are_pointed_out(
     (run,) = (RunFolder(path) for path in Path("runs").rglob("v_lstm/*-s0*"))
     train = ("train", "experiment=rpi/v_lstm", *TINY, "seed=0", f"run_dir={run.path}")
     assert "holds a finished run of other code than the present one: nothing is overwritten" in refused(*train)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        assert epo(*train, "existing=continue") == 0, "a finished run does not continue"
     run.update(status="training")
     with pytest.warns(UserWarning, match="began with other code than the present one, with which it continues"):
         assert epo("train", f"resume={run.path}") == 0

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import os
+import random
 import resource
 import shutil
 import signal
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
+import numpy
 import pytest
 import torch
 from experiment.conftest import TINY, Epo
 from lightning.pytorch import Trainer
 
 from epo_lightning.experiment import train as training
-from epo_lightning.experiment.callbacks import LastCheckpoint
+from epo_lightning.experiment.callbacks import LastCheckpoint, RandomStates
 from epo_lightning.experiment.csv_log import CSVLog
 from epo_lightning.files import read_json
 from epo_lightning.forecasters.base import Forecaster
@@ -105,6 +109,20 @@ def test_a_run_that_is_stopped_at_the_end_of_an_epoch_logs_every_epoch_once(epo:
     assert sorted(path.name for path in Path("parts/checkpoints").iterdir()) == ["best.ckpt", "last.ckpt"]
 
 
+def test_an_epoch_that_was_stored_before_its_row_was_logged_does_not_count(tmp_path: Path) -> None:
+    last, ended = tmp_path / "last.ckpt", tmp_path / "ended.ckpt"
+    last.write_text("the epoch before")
+    ended.write_text("stopped before its row")
+    kept, trainer = LastCheckpoint(tmp_path), cast(Trainer, SimpleNamespace(is_global_zero=True))
+    module = cast(Forecaster, None)
+    kept.on_fit_start(trainer, module)
+    kept.on_train_epoch_start(trainer, module)
+    assert last.read_text() == "the epoch before"
+    ended.write_text("with its row")
+    kept.on_train_end(trainer, module)
+    assert last.read_text() == "with its row"
+
+
 def test_a_run_of_an_earlier_version_continues_and_keeps_its_checkpoint_until_the_next_row_is_logged(
     epo: Epo, recwarn: pytest.WarningsRecorder
 ) -> None:
@@ -157,6 +175,29 @@ def test_a_continued_run_draws_the_random_numbers_of_an_uninterrupted_one(epo: E
             epo(*words, "run_dir=stopped")
     assert epo("train", "resume=stopped") == 0
     assert same("whole", "stopped")
+
+
+def test_the_random_states_of_all_libraries_are_restored_before_the_batches_of_the_epoch_are_drawn(
+    tmp_path: Path,
+) -> None:
+    def drawn() -> tuple[float, ...]:
+        return torch.rand(1).item(), numpy.random.normal(), random.random()  # noqa: NPY002 - the global generator
+
+    class Batches:
+        def __iter__(self) -> Iterator[float]:
+            self.first = drawn()
+            return iter(())
+
+    drawn()  # NumPy draws normal numbers two at a time and has kept the second one
+    torch.save(RandomStates().state_dict(), tmp_path / "states")
+    expected = [drawn(), drawn()]
+    continued, batches = RandomStates(), Batches()
+    continued.load_state_dict(torch.load(tmp_path / "states", weights_only=True))
+    trainer: Any = SimpleNamespace(fit_loop=SimpleNamespace(_data_fetcher=batches))
+    continued.on_train_epoch_start(trainer, trainer)
+    assert [batches.first, drawn()] == expected
+    continued.on_train_epoch_start(trainer, trainer)
+    assert drawn() not in expected, "only the first epoch of a continued run begins with these states"
 
 
 @pytest.mark.parametrize("between", [2, 3, 5, 8])

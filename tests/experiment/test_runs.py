@@ -18,6 +18,7 @@ from filelock import FileLock
 
 import epo_lightning
 from epo_lightning.experiment import evaluate
+from epo_lightning.experiment import train as training
 from epo_lightning.files import write_json
 from epo_lightning.forecasters.checkpoint import read_checkpoint
 from epo_lightning.identity import identity, row_identity
@@ -162,6 +163,15 @@ def test_scores_that_are_stored_are_computed_again_in_a_folder_that_cannot_be_wr
     assert epo("evaluate", "run=run") == 0
 
 
+def test_an_interruption_says_how_to_continue_what_has_begun(tmp_path: Path) -> None:
+    for run, notes in ((RunFolder(tmp_path / "waiting"), []), (RunFolder(tmp_path / "begun"), ["continue with"])):
+        if notes:
+            run.begin({"seed": 0}, {})
+        with pytest.raises(KeyboardInterrupt) as ended, training._continuation(run):
+            raise KeyboardInterrupt
+        assert [note.partition(" `")[0] for note in getattr(ended.value, "__notes__", [])] == notes
+
+
 def test_a_finished_run_is_never_overwritten(
     epo: Epo, refused: Callable[..., str], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -237,6 +247,9 @@ def test_checkpoints_that_do_not_fit_are_refused(epo: Epo, refused: Callable[...
     assert epo("train", ROW, *TINY, "run_dir=sc") == 0
     assert epo("train", "experiment=rpi/v_lstm", *TINY, "run_dir=marginal") == 0
     assert "another architecture" in refused("evaluate", "run=sc", "checkpoint=marginal/checkpoints/best.ckpt")
+    assert epo("train", ROW, *TINY, "goal=all", "run_dir=all") == 0
+    message = refused("evaluate", "run=sc", "checkpoint=all/checkpoints/best.ckpt")
+    assert "goal is all in the checkpoint and energy in the run's config.yaml" in message
     assert "not a checkpoint" in refused("evaluate", "run=sc", "checkpoint=sc/run.json")
     assert "no checkpoint" in refused("evaluate", "run=sc", "checkpoint=nowhere.ckpt")
     Path("marginal/checkpoints/best.ckpt").unlink()

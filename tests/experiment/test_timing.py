@@ -133,6 +133,9 @@ def test_one_run_has_scores_and_a_time(epo: Epo, tmp_path: Path, capsys: pytest.
     assert epo("train", *DRAWN, *words, "existing=continue") == 0
     assert run.metrics_file("test").stat().st_mtime_ns == measured["test"], "it was scored again"
     assert run.metrics_file("time").stat().st_mtime_ns > measured["time"]
+    run.metrics_file("test").unlink()
+    assert epo("train", f"resume={run.path}") == 0, "it is finished, and lacks a measurement"
+    assert run.metrics_file("test").is_file()
 
 
 def test_a_run_that_lacks_what_it_was_asked_for_is_not_ready_for_a_report(

@@ -107,6 +107,9 @@ def test_only_equal_scores_of_the_same_data_share_a_file(tmp_path: Path) -> None
     ]
     assert len({first, *files}) == 5
     assert first.read_bytes() == content
+    write_json(first, {**scored, "metrics": metrics, "notes": ["of an earlier version"]})
+    assert keep(run, {**scored, "metrics": metrics, "notes": []}, checkpoint) == first
+    assert read_json(first)["notes"] == ["of an earlier version"]
     write_json(first, {**scored, "metrics": metrics, "truth": {"pair_error": None}})  # damaged: written again
     assert keep(run, {**scored, "metrics": metrics}, checkpoint) == first
     assert "truth" not in read_json(first)
