@@ -268,3 +268,11 @@ def test_several_processes_share_one_database(tmp_path: Path) -> None:
     runs = there.search_runs([there.get_experiment_by_name("epo_lightning").experiment_id])
     assert sorted(run.info.run_name for run in runs) == [f"V-LSTM + SC (seed {seed})" for seed in range(4)]
     assert all(run.data.metrics["best/minSADE"] > 0 and run.info.status == "FINISHED" for run in runs)
+
+
+def test_the_summary_has_the_epoch_with_the_smallest_score_that_is_a_number(tmp_path: Path) -> None:
+    run = RunFolder(tmp_path)
+    run.logs.mkdir()
+    rows = ("3,nan,0.1", "7,0.5,0.2", "11,0.3,0.4", "15,,0.0", "19,0.6,0.3")
+    (run.logs / "metrics.csv").write_text("\n".join(("step,val/minSADE,val/minADE", *rows, "")))
+    assert logs.scores(run, "val/minSADE") == {"best/minSADE": 0.3, "best/minADE": 0.4}

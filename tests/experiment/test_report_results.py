@@ -17,9 +17,12 @@ from report.test_transfer import three_runs
 
 from epo_lightning.experiment.config.settings import ReportSettings
 from epo_lightning.experiment.report import NOT_DRAWN, report
+from epo_lightning.experiment.report_scenes import _best_of_titles
 from epo_lightning.files import write_json
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.results import _digest, save_results
+from epo_lightning.report.runs import collect
+from epo_lightning.report.tables import build_tables, distinct
 from epo_lightning.report.write import Report
 from epo_lightning.run_folder import RunFolder
 
@@ -171,6 +174,15 @@ def test_a_secret_that_an_older_version_recorded_is_in_no_results_file_and_no_ta
     assert "https://me:***@host/mlflow" in Path("one/results.md").read_text()
     written = {**files(Path("one")), **rebuilt(file), "file": file.read_bytes()}
     assert [name for name, content in written.items() if b"pa55word" in content] == []
+
+
+def test_of_the_rows_of_a_title_the_best_one_on_the_first_data_is_drawn() -> None:
+    for lr, value, data in ((0.05, math.nan, "a"), (0.1, 0.3, "a"), (0.2, 0.2, "a"), (0.4, 0.1, "b")):
+        settings = {"optimizer.lr": lr}
+        make_run(Path("runs") / str(lr), "V-LSTM", "marginal", scores(value), data=data, digest=data, settings=settings)
+    make_run(Path("runs/sc"), "SC", "scene_consistent", scores(0.9), data="a", digest="a")
+    drawn = _best_of_titles(distinct(build_tables(collect("runs"))))
+    assert [(row.title, row.cells["minSADE"].mean) for row in drawn] == [("V-LSTM", 0.2), ("SC", 0.9)]
 
 
 def edited(text: str) -> str:

@@ -63,6 +63,13 @@ def test_the_status_of_a_sweep_says_how_to_continue(runs: Path, capsys: pytest.C
     assert hint not in capsys.readouterr().out, "the sweep runs"
 
 
+def test_runs_of_earlier_starts_that_were_removed_are_not_counted(runs: Path) -> None:
+    sweep = begin(runs, "rpi_main", {})
+    write_json(sweep.folder / "sweep.json", {**sweep.record, "former": ["gone", "there"]})
+    (runs / "there").mkdir()
+    assert [run.path for run in sweep.former] == [runs / "there"]
+
+
 def test_a_trained_run_is_running_while_it_is_scored(runs: Path) -> None:
     run = finish(make_run(runs / "a", "V-LSTM", "marginal", None))
     sweep = begin(runs, "rpi_main", {"a": None})

@@ -141,6 +141,13 @@ def test_a_long_scoring_says_how_far_it_is(capsys: pytest.CaptureFixture[str], m
     ]
 
 
+def test_a_check_of_a_configuration_draws_no_random_numbers() -> None:
+    settings = read(Settings, compose("train", ["experiment=rpi/v_lstm_sc", "data=drawn", "data.like=rpi"]))
+    before = torch.get_rng_state()
+    assembly.check_buildable(settings)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
 def test_the_progress_of_a_continued_run_says_from_which_step_it_went_on(tmp_path: Path) -> None:
     trainer: Any = SimpleNamespace(global_step=40, estimated_stepping_batches=100.0, max_steps=-1)
     run, often, seldom = RunFolder(tmp_path), callbacks.Progress(RunFolder(tmp_path), every=0.0), math.inf

@@ -158,5 +158,7 @@ def test_a_port_that_is_taken_is_named(tmp_path: Any, monkeypatch: pytest.Monkey
         port = taken.getsockname()[1]
         with pytest.raises(ConfigError, match=f"port {port} cannot be used"):
             explore(ExploreSettings(run=RUN, port=port), [], print)
+        with pytest.raises(ConfigError, match=r"no checkpoint .*nowhere\.ckpt"):
+            explore(ExploreSettings(run=RUN, port=port, checkpoint="nowhere.ckpt"), [], print)
     with pytest.raises(ConfigError, match="port must be a number from 0 to 65535"):
         ExploreSettings(run=RUN, port=70000)
