@@ -181,8 +181,10 @@ def test_of_the_rows_of_a_title_the_best_one_on_the_first_data_is_drawn() -> Non
         settings = {"optimizer.lr": lr}
         make_run(Path("runs") / str(lr), "V-LSTM", "marginal", scores(value), data=data, digest=data, settings=settings)
     make_run(Path("runs/sc"), "SC", "scene_consistent", scores(0.9), data="a", digest="a")
+    make_run(Path("runs/nan"), "Diverged", "scene_consistent", scores(math.nan), data="a", digest="a")
     drawn = _best_of_titles(distinct(build_tables(collect("runs"))))
-    assert [(row.title, row.cells["minSADE"].mean) for row in drawn] == [("V-LSTM", 0.2), ("SC", 0.9)]
+    found = {row.title: row.cells["minSADE"].mean for row in drawn}
+    assert found == pytest.approx({"V-LSTM": 0.2, "SC": 0.9, "Diverged": math.nan}, nan_ok=True)
 
 
 def edited(text: str) -> str:
