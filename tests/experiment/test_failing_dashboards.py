@@ -118,7 +118,8 @@ def test_a_dashboard_that_cannot_keep_up_is_dropped(
         logger.log_metrics({"a": 1.0}, step)
     logger.close(Ending())
     assert time.monotonic() - began < 5
-    assert capsys.readouterr().err.count("50 rows behind") == 1
+    said = capsys.readouterr().err
+    assert said.count("50 rows behind") == said.count("switched off for this run") == 1
 
 
 def test_a_slow_dashboard_gets_every_row_in_order_and_costs_the_run_nothing(tmp_path: Path) -> None:

@@ -290,7 +290,9 @@ def test_the_hash_of_the_code_is_that_of_the_files_on_which_results_depend(
     for file in (package / "backbones" / "mine.py", other / "parts.py", tmp_path / "elsewhere" / "single.py"):
         file.write_text("x = 2\n")
         hashes.append(provenance.code.__wrapped__())
-    assert len(set(hashes)) == 4
+    (other / "parts.py").rename(other / "renamed.py")
+    hashes.append(provenance.code.__wrapped__())
+    assert len(set(hashes)) == 5
     (package / "report" / "page.py").write_text("x = 2\n")
     (tmp_path / "elsewhere" / "unrelated.py").touch()
     (package / "backbones" / ".#mine.py").symlink_to("me@host.123")  # a lock of Emacs
