@@ -144,6 +144,16 @@ def canonical(content: Any) -> str:
     return json.dumps(content, sort_keys=True, default=str)
 
 
+DIGEST = "digest"
+"""Key of a file's content with the digest of everything else."""
+
+
+def digest_of(content: Mapping[str, Any]) -> str:
+    """Hash of a file's content without its :data:`DIGEST`."""
+    rest = {key: value for key, value in content.items() if key != DIGEST}
+    return hashlib.sha256(canonical(rest).encode()).hexdigest()[:16]
+
+
 def leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Dotted keys of nested sections, with their values; an empty section is a value."""
     for key, value in values.items():

@@ -2,46 +2,32 @@
 
 from __future__ import annotations
 
-import math
 import os
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from filelock import FileLock, Timeout
 from lightning.pytorch import Trainer, seed_everything
 from lightning.pytorch.callbacks import TQDMProgressBar
 
 from epo_lightning import pretrained
-from epo_lightning.data.cache import file_digest
 from epo_lightning.data.rpi.scenes import RPIData
 from epo_lightning.experiment import assembly, gpus, logs
 from epo_lightning.experiment.callbacks import ScoringLines, style_of
 from epo_lightning.experiment.config.replaced import keys_of
 from epo_lightning.experiment.config.settings import EvaluateSettings, Settings, TrainerSettings
 from epo_lightning.experiment.opening import open_checkpoint, open_data, refuse_unfinished, settings_of, split_of
-from epo_lightning.experiment.other_data import OtherData, open_other
+from epo_lightning.experiment.other_data import open_other
 from epo_lightning.experiment.provenance import of_other_code
+from epo_lightning.experiment.score_files import alone, keep, keep_other
 from epo_lightning.experiment.truth import TruthTest
-from epo_lightning.files import read_json, write_json
 from epo_lightning.metrics import ForecastMetrics
-from epo_lightning.metrics.forecast import OWN
-from epo_lightning.registry import ConfigError, parts
-from epo_lightning.report.columns import TRUE, is_own
-from epo_lightning.run_folder import OTHER, RunFolder, discover, neighbour, numbered
+from epo_lightning.registry import ConfigError
+from epo_lightning.report.columns import TRUE
+from epo_lightning.run_folder import RunFolder, discover, neighbour
 from epo_lightning.schema import read
-
-SECTIONS = ("metrics", "truth")
-"""Sections of a file of scores that hold numbers by name."""
-LOCK = ".scores.lock"
-"""File in a run folder that a process locks while it writes scores: two evaluations may end at the same moment."""
-PATIENCE = 60.0
-"""Longest wait for another process that writes scores [s]."""
-TOLERANCE = 1e-5
-"""Relative difference below which two scores are the same: machines and batch sizes change the last digits."""
 
 
 def evaluate(config: dict[str, Any], overrides: Sequence[str] = ()) -> list[tuple[RunFolder, Path, dict[str, float]]]:
@@ -118,7 +104,8 @@ def score(
 ) -> tuple[Path, dict[str, float]]:
     """Score one run and write its scores to a file, except for runs that ship with the package.
 
-    Scores on the run's own data go to the files of :func:`keep`, those on other data to the files of :func:`keep_other`.
+    Scores on the run's own data go to the files of :func:`.score_files.keep`, those on other data to those of
+    :func:`.score_files.keep_other`.
 
     Args:
         run: a finished run.
@@ -147,7 +134,7 @@ def score(
             print(f"  {note}")
         if pretrained.ships(run.path):
             return run.path, metrics
-        with _alone(run):
+        with alone(run):
             return keep_other(run, other, which, checkpoint, metrics), metrics
     data = open_data(run, of_run, settings.batch_size)
     if data.task.subsets != forecaster.task.subsets:  # a checkpoint that is older than the subsets of its data
@@ -161,7 +148,7 @@ def score(
     scored = {"split": settings.own_split, "data_digest": data.digest, "checkpoint": which, "metrics": metrics}
     if costs:
         scored["truth"] = costs
-    with _alone(run):
+    with alone(run):
         file = keep(run, scored, checkpoint)
     if file == run.metrics_file():
         logs.publish(run)
@@ -207,131 +194,3 @@ def _test(
         (scores,) = trainer.test(forecaster, dataloaders=loader, verbose=False)
     metrics = {name.removeprefix("test/"): float(value) for name, value in scores.items()}
     return metrics, {} if truths is None else truths.scores()
-
-
-def keep_other(run: RunFolder, other: OtherData, which: str, checkpoint: Path, metrics: Mapping[str, float]) -> Path:
-    """Write scores on other data to a file of their own, and return it.
-
-    The name ``scores-on-<data>-<split>-<digest>-<digest>.json`` has digests of the test and of the checkpoint. If the file
-    holds the same scores it stays as it is; if it holds others, which another version computed, the name gets a number.
-    """
-    digest = file_digest(checkpoint)[:16]
-    stem = f"{OTHER}{other.name}-{other.split}-{other.test[:8]}-{digest[:8]}"
-    scored = {
-        "data": other.name,
-        "split": other.split,
-        "data_digest": other.digest,
-        "test": other.test,
-        "checkpoint": which,
-        "checkpoint_digest": digest,
-        "settings": {key: value for key, value in other.section.items() if key != "root"},
-        "notes": list(other.notes),
-        **other.about(),
-        "metrics": dict(metrics),
-    }
-    return _beside(run, stem, scored, ("test", "checkpoint_digest"))
-
-
-def keep(run: RunFolder, scored: dict[str, Any], checkpoint: Path) -> Path:
-    """Write scores without ever replacing others, and return the file that holds them.
-
-    The scores of the best checkpoint are ``metrics.json`` (``metrics-val.json`` on the validation split). If that file holds
-    the same scores already it stays as it is; if they lack scores that older versions did not compute, these are added.
-    Registered metrics are replaced.
-    Scores of another checkpoint, and scores that differ from those in the file, go to
-    ``scores-<split>-<checkpoint>-<digest>.json``, which records the digest of the checkpoint as well as of the data. If that
-    file holds others, the name gets a number.
-    """
-    file = run.metrics_file(scored["split"])
-    if scored["checkpoint"] == "best":
-        if not _readable(file):
-            write_json(file, scored)
-        stored = read_json(file)
-        if _same(stored, scored):
-            _complete(file, scored)
-            return file
-    digest = file_digest(checkpoint)[:16]
-    stem = f"scores-{scored['split']}-{Path(scored['checkpoint']).stem}-{digest[:8]}"
-    return _beside(run, stem, {**scored, "checkpoint_digest": digest}, ("data_digest", "checkpoint_digest"))
-
-
-@contextmanager
-def _alone(run: RunFolder) -> Iterator[None]:
-    """Context in which no other process writes scores of the run. A folder that cannot be written needs no lock.
-
-    Raises:
-        ConfigError: another process holds the lock for longer than scores take to be written.
-    """
-    lock = FileLock(run.path / LOCK, timeout=PATIENCE)
-    try:
-        lock.acquire()
-    except Timeout:
-        raise ConfigError(
-            f"another process has written scores of {run.path} for {PATIENCE:.0f} s: stop it, or remove {run.path / LOCK}"
-        ) from None
-    except OSError:
-        yield
-        return
-    try:
-        yield
-    finally:
-        lock.release()
-
-
-def _beside(run: RunFolder, stem: str, scored: dict[str, Any], keys: Sequence[str]) -> Path:
-    """The file of a stem, with a number if need be, that holds these scores; written if there is none."""
-    for file in numbered(run.path / f"{stem}.json"):
-        if not _readable(file):
-            write_json(file, scored)
-            return file
-        if _same(read_json(file), scored, keys):
-            _complete(file, scored)
-            return file
-    raise AssertionError("unreachable")
-
-
-def _complete(file: Path, scored: Mapping[str, Any]) -> None:
-    """Add scores that a file lacks; registered metrics get their new values, because their code is the user's."""
-    stored = read_json(file)
-    completed: dict[str, Any] = {**scored, **stored}
-    registered = tuple(OWN + name for name in parts("metric"))
-    for section in (name for name in SECTIONS if name in completed):
-        own = {name: value for name, value in scored.get(section, {}).items() if is_own(name)}
-        # A metric that is registered now and has no value has lost its earlier one.
-        kept = {name: value for name, value in stored.get(section, {}).items() if not name.endswith(registered)}
-        completed[section] = {**scored.get(section, {}), **kept, **own}
-    if completed != stored:
-        write_json(file, completed)
-
-
-def _readable(file: Path) -> bool:
-    """Whether a file holds scores. The caller replaces a missing or damaged file."""
-    try:
-        content = read_json(file)
-    except ConfigError:
-        return False
-    return all(
-        isinstance(scores, dict) and all(isinstance(value, int | float) for value in scores.values())
-        for scores in (content.get("metrics"), content.get("truth", {}))
-    )
-
-
-def _same(
-    stored: dict[str, Any], scored: dict[str, Any], keys: Sequence[str] = ("split", "data_digest", "checkpoint")
-) -> bool:
-    """Whether new scores are of the same data and checkpoint as stored ones, and equal them up to the last digits.
-
-    Registered metrics are not compared.
-    """
-    if any(stored.get(key) != scored[key] for key in keys):
-        return False
-    pairs = [
-        (value, scored.get(section, {}).get(name, math.inf))
-        for section in SECTIONS
-        for name, value in stored.get(section, {}).items()
-        if not is_own(name)
-    ]
-    return all(
-        math.isclose(one, other, rel_tol=TOLERANCE, abs_tol=1e-9) or (math.isnan(one) and math.isnan(other))
-        for one, other in pairs
-    )

@@ -22,7 +22,6 @@ The file has no weights, scenes or forecasts, so pictures of scenes and of learn
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -30,7 +29,7 @@ from pathlib import Path
 from typing import Any
 
 from epo_lightning.files import read_json, write_file
-from epo_lightning.identity import ELSEWHERE, SECTIONS, canonical
+from epo_lightning.identity import DIGEST, ELSEWHERE, SECTIONS, digest_of
 from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.curves import METRIC
@@ -122,7 +121,7 @@ def save_results(report: Report, file: str | Path) -> None:
         "runs": [_saved(run, reported.get(run.path, [])) for run in report.runs],
     }
     content = mask(content)
-    write_file(Path(file).expanduser(), json.dumps({**content, "digest": _digest(content)}, indent=1) + "\n")
+    write_file(Path(file).expanduser(), json.dumps({**content, DIGEST: digest_of(content)}, indent=1) + "\n")
 
 
 def _saved(run: Records, reported: Sequence[str]) -> dict[str, Any]:
@@ -139,9 +138,14 @@ def _saved(run: Records, reported: Sequence[str]) -> dict[str, Any]:
         "reported": list(reported),
         "config": settings,
         "record": {key: record[key] for key in RECORDED if key in record},
-        "scores": {name: run.content(name) for name in names},
+        "scores": {name: _without_digest(run.content(name)) for name in names},
         "log": [[row[column] for column in LOGGED if column in row] for row in validations],
     }
+
+
+def _without_digest(scores: Mapping[str, Any]) -> dict[str, Any]:
+    """Scores without their digest, which secrets that are masked would change; the whole file has one of its own."""
+    return {key: value for key, value in scores.items() if key != DIGEST}
 
 
 def read_results(file: str | Path) -> Report:
@@ -162,11 +166,11 @@ def read_results(file: str | Path) -> Report:
         raise ConfigError(
             f"{file} is a results file of version {content.get('version')!r}, this program reads version {VERSION}; {again}"
         )
-    digest = content.pop("digest", None)
+    digest = content.pop(DIGEST, None)
     remedy = (
         f"take the committed file again, or write it again with `{content.get('command', 'epo report')} save={file}`"
     )
-    if digest != _digest(content):
+    if digest != digest_of(content):
         raise ConfigError(
             f"{file} is damaged: its content does not have the digest {digest}; was it edited, or copied incompletely? "
             f"{remedy[0].upper()}{remedy[1:]}"
@@ -216,7 +220,3 @@ def _read_entry(entry: Mapping[str, Any], where: str, remedy: str) -> tuple[Save
                 f"{', '.join(known) or 'no split'}; {remedy}"
             )
     return run, [one for one in found if one.split in entry["reported"]]
-
-
-def _digest(content: Mapping[str, Any]) -> str:
-    return hashlib.sha256(canonical(content).encode()).hexdigest()[:16]

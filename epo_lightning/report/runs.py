@@ -8,7 +8,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
-from epo_lightning.identity import check_unchanged, data_recipe, identity, row_identity
+from epo_lightning.identity import DIGEST, check_unchanged, data_recipe, digest_of, identity, row_identity
 from epo_lightning.masking import mask
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.columns import TRUE
@@ -247,6 +247,8 @@ def _evaluated(
 ) -> EvaluatedRun:
     """The scores in one file of a run folder; ``again`` says how to write it again."""
     metrics = _entry(result, file, again, "metrics")
+    if result.get(DIGEST, digest_of(result)) != digest_of(result):  # earlier versions wrote none
+        raise ConfigError(f"{file} was edited: its scores do not have the digest {result[DIGEST]}; {again}")
     check_known(result, dict.fromkeys(("metrics", "truth"), NUMBERS_BY_NAME), str(file), again)
     of_costs = {f"{TRUE}{name}": value for name, value in result.get("truth", {}).items()}
     if result.get("split", split) != split:

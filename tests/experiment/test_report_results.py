@@ -19,8 +19,9 @@ from epo_lightning.experiment.config.settings import ReportSettings
 from epo_lightning.experiment.report import NOT_DRAWN, report
 from epo_lightning.experiment.report_scenes import _best_of_titles
 from epo_lightning.files import write_json
+from epo_lightning.identity import digest_of
 from epo_lightning.registry import ConfigError
-from epo_lightning.report.results import _digest, save_results
+from epo_lightning.report.results import save_results
 from epo_lightning.report.runs import collect
 from epo_lightning.report.tables import build_tables, distinct
 from epo_lightning.report.write import Report
@@ -282,7 +283,7 @@ def test_a_damaged_entry_with_a_fitting_digest_is_named(path: str, value: object
         del place[last]
     else:
         place[last] = value
-    file.write_text(json.dumps({**content, "digest": _digest(content)}))
+    file.write_text(json.dumps({**content, "digest": digest_of(content)}))
     with pytest.raises(ConfigError, match=message):
         report(ReportSettings(results=str(file), out="two"))
     assert not Path("two").exists()

@@ -17,9 +17,9 @@ from experiment.conftest import TINY, Epo
 from filelock import FileLock
 
 import epo_lightning
-from epo_lightning.experiment import evaluate
+from epo_lightning.experiment import score_files
 from epo_lightning.experiment import train as training
-from epo_lightning.files import write_json
+from epo_lightning.files import read_json, write_json
 from epo_lightning.forecasters.checkpoint import read_checkpoint
 from epo_lightning.identity import identity, row_identity
 from epo_lightning.registry import ConfigError
@@ -122,7 +122,7 @@ def test_the_same_seed_gives_the_same_metrics_and_another_does_not(epo: Epo) -> 
     one, two, three = (RunFolder(Path(name)).metrics_file().read_bytes() for name in ("one", "two", "three"))
     assert one == two
     assert one != three
-    assert set(json.loads(one)) == {"split", "data_digest", "checkpoint", "metrics"}
+    assert set(json.loads(one)) == {"split", "data_digest", "checkpoint", "metrics", "digest"}
 
 
 def test_constant_velocity_has_a_run_folder_and_scores(epo: Epo) -> None:
@@ -143,8 +143,8 @@ def test_two_evaluations_do_not_write_at_the_same_moment(
     epo: Epo, refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert epo("train", ROW, *TINY, "run_dir=run") == 0
-    monkeypatch.setattr(evaluate, "PATIENCE", 0.1)
-    with FileLock(f"run/{evaluate.LOCK}"):
+    monkeypatch.setattr(score_files, "PATIENCE", 0.1)
+    with FileLock(f"run/{score_files.LOCK}"):
         for words in ((), ("data=drawn", "data.like=rpi", "data.scenes=8")):
             assert "another process has written scores of run for" in refused("evaluate", "run=run", *words)
     assert epo("evaluate", "run=run") == 0
@@ -159,7 +159,7 @@ def test_scores_that_are_stored_are_computed_again_in_a_folder_that_cannot_be_wr
     def refuse(*_: object, **__: object) -> None:
         raise PermissionError(13, "Permission denied", "run/.scores.lock")
 
-    monkeypatch.setattr(evaluate.FileLock, "acquire", refuse)
+    monkeypatch.setattr(score_files.FileLock, "acquire", refuse)
     assert epo("evaluate", "run=run") == 0
 
 
@@ -232,6 +232,19 @@ def test_a_damaged_record_is_not_blamed_on_the_configuration(
     assert epo("train", ROW, *TINY, "run_dir=run") == 0
     RunFolder(Path("run")).update(**{key: value})
     assert f"run/run.json: {key} is {value!r}, expected text" in refused("evaluate", "run=run")
+
+
+def test_scores_that_were_edited_are_found_and_written_again(epo: Epo, refused: Callable[..., str]) -> None:
+    assert epo("train", ROW, *TINY, "run_dir=run", "score=test") == 0
+    file = Path("run/metrics.json")
+    written = read_json(file)
+    write_json(file, {**written, "metrics": {**written["metrics"], "minSADE": 0.01}})
+    assert "run/metrics.json was edited: its scores do not have the digest" in refused(
+        "report", "runs=run", "out=report"
+    )
+    assert epo("evaluate", "run=run") == 0
+    assert read_json(file) == written
+    assert epo("report", "runs=run", "out=report", "scenes=false") == 0
 
 
 def test_a_folder_that_cannot_be_written_is_refused_before_anything_is_scored(

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from epo_lightning.experiment import truth
-from epo_lightning.experiment.evaluate import keep
+from epo_lightning.experiment.score_files import keep
 from epo_lightning.files import read_json, write_json
 from epo_lightning.forecast import GameParameters, JointForecast
 from epo_lightning.run_folder import RunFolder
