@@ -37,6 +37,7 @@ SLOW = ("highway_sim.md-0", "features.md-0")
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in BLOCKS])
 def test_code_blocks_run(name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("EPO_CACHE", str(tmp_path))
+    monkeypatch.chdir(tmp_path)  # where blocks write their pictures
     monkeypatch.syspath_prepend(str(ROOT))  # for `benchmarks`, which runs from the root of the repository
     text = BLOCKS[name]
     for one, other in CHEAPER.items():
