@@ -168,7 +168,7 @@ def test_measurements_have_one_canonical_order(score: Any, found: tuple[str, ...
 @pytest.mark.parametrize("score", ["[test,tiem]", "speed", "[[test]]", "1"])
 def test_unknown_measurements_are_refused(refused: Callable[..., str], score: str) -> None:
     message = refused("train", "experiment=rpi/v_lstm", *DRAWN, f"score={score}")
-    assert "score must be one of test, val, time or a list with any of test, val, time or null" in message
+    assert "score must be one of test, val, time, or a list with any of test, val, time, or null" in message
 
 
 def test_measurements_do_not_change_the_identity_of_a_run(untrained: RunFolder) -> None:

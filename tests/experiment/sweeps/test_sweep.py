@@ -218,7 +218,7 @@ def test_a_run_is_done_when_all_measurements_exist(epo: Epo, capsys: pytest.Capt
         assert sweep.state(job) == "trained, not scored"
         (folder / "aside").rename(job.run.metrics_file(which))
     scores = r"val/minSADE \d+\.\d{4}, test/minSADE \d+\.\d{4}"
-    assert re.fullmatch(scores + r", \d+ s, \d+\.\d ms per forecast", result(job))
+    assert re.fullmatch(scores + r", \d+ s of training, \d+\.\d ms per forecast", result(job))
     assert epo(*words, "score=[time,test]", "trainer.threads=2") == 0
     assert (folder / "runtime-cpu-1.json").is_file(), "another time that was measured as well"
 
