@@ -36,7 +36,7 @@ FORMAT = 1
 """Version of the layout. A data set of another version is refused."""
 MANIFEST = "manifest.json"
 LARGE = 1 << 31
-"""Size [bytes] above which a split's file is memory-mapped, and its checksum computed only once."""
+"""Size [bytes] from which on a split's file is memory-mapped, and its checksum computed only once."""
 SPLITS = ("train", "val", "test")
 PACKAGES = ("epo_lightning", "numba", "numpy", "safetensors", "torch")
 
@@ -232,10 +232,10 @@ def manifest(folder: Path, command: str = "", config: Mapping[str, Any] | None =
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         found, name = content["format"], content["hash"]
-        content["files"], content["config"]
+        [(facts["bytes"], facts["sha256"]) for facts in content["files"].values()], content["config"]
     except FileNotFoundError:
         raise _broken(f"{path} is missing, so the data beside it is not a complete data set", folder, command) from None
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise _broken(f"{path} is not a readable manifest ({type(error).__name__}: {error})", folder, command) from None
     if found != FORMAT:
         raise _broken(f"{path} has format {found}, this version reads format {FORMAT}", folder, command)

@@ -258,7 +258,7 @@ class ScoringLines(Callback):
     ) -> None:
         self._scored += len(batch.history)
         now = time.monotonic()
-        if now - self._told < self.every or self._scored >= self._scenes:
+        if now - self._told < self.every or not 0 < self._scored < self._scenes:
             return
         self._told = now
         left = (now - self._began) * (self._scenes - self._scored) / self._scored

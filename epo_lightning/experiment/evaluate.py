@@ -166,8 +166,9 @@ def _test(
 ) -> tuple[dict[str, float], dict[str, Any]]:
     """Scores of a forecaster on the batches of a loader, and the costs of ``truths``."""
     style = style_of(of_run.callbacks)
+    scenes = len(loader.dataset) if hasattr(loader, "dataset") else None  # a loader of one's own may not say it
     if style != "none":
-        print(f"scoring {len(loader.dataset)} scenes", flush=True)
+        print("scoring" if scenes is None else f"scoring {scenes} scenes", flush=True)
     seed_everything(of_run.seed, workers=True, verbose=False)
     machine = machine or of_run.trainer
     torch.set_num_threads(machine.threads)
@@ -183,7 +184,7 @@ def _test(
             callbacks=[
                 *([] if truths is None else [truths]),
                 *([TQDMProgressBar(refresh_rate=of_run.callbacks.refresh)] if style == "bar" else []),
-                *([ScoringLines(len(loader.dataset))] if style == "lines" else []),
+                *([ScoringLines(scenes)] if style == "lines" and scenes is not None else []),
             ],
             logger=False,
             enable_checkpointing=False,

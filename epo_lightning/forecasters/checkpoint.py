@@ -25,7 +25,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     path = Path(path)
     if not path.is_file():
         others = sorted(file.name for file in path.parent.glob("*.ckpt"))
-        if others:
+        if others and path.suffix == ".ckpt":  # not the name of a forecaster
             raise ConfigError(f"no checkpoint at {path}; the folder has {', '.join(others)}")
         raise ConfigError(
             f"no checkpoint at {path}: give the path of a .ckpt file, such as RUN/checkpoints/best.ckpt, or the name of a "

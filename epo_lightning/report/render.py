@@ -49,6 +49,7 @@ MISSED = (
     "Missed is the share of the scenes of that alternative whose future is more than 0.25 m (SADE) from every mode."
 )
 
+FEWER = "A cell with n=... is of those seeds alone that have the score."
 TRUE_COSTS = (
     "Inferred costs of the most likely mode in units of the true cost of controls, against those of the games that made "
     "the data. w is the weight of the pair term; its rank correlation is best at 1. Errors are relative: medians of scenes."
@@ -158,7 +159,6 @@ def legend(
     mean = (
         "Mean ± sample standard deviation over n seeds" if any(cell.deviation is not None for _, cell in shown) else ""
     )
-    mean += ", or over those seeds that have the score, with their number in the cell" if fewer else ""
     paper = (
         f"{where}, the paper's value and ours minus the paper's"
         if any(cell.paper is not None for _, cell in shown)
@@ -175,6 +175,7 @@ def legend(
     parts = (
         f"Displacements in m, minimum over the modes{few}{rates}; lower is better." if errors else "",
         f"{numbers[0].upper()}{numbers[1:]}." if numbers else "",
+        FEWER if fewer else "",
         ranked if any(cell.rank for _, cell in shown) else "",
         rules if overlaps else "",
         EFFECT if any(Column(metric, "").is_effect for metric in metrics) else "",

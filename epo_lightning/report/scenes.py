@@ -33,13 +33,14 @@ def draw(scene: Scene, forecast: JointForecast, path: str | Path, title: str = "
         title: title of the picture.
 
     Raises:
-        ValueError: not exactly one scene, or a scene without agents.
+        ValueError: not exactly one scene, a scene without agents, or a path with another ending than .png.
     """
+    view = SceneView.of(scene)
     order = by_probability(forecast)
     futures = [joint_mode(forecast, m, f"mode {m + 1}") for m in order[:MOST_MODES]]
     if len(order) > MOST_MODES:
         title = ": ".join(filter(None, (title, f"the {MOST_MODES} most likely of {len(order)} modes")))
-    return _picture(scene, futures, path, title)
+    return _picture(view, futures, path, title)
 
 
 def draw_rows(scene: Scene, forecasts: Mapping[str, JointForecast], path: str | Path) -> Path:
@@ -54,12 +55,14 @@ def draw_rows(scene: Scene, forecasts: Mapping[str, JointForecast], path: str | 
     """
     if not forecasts:
         raise ValueError("comparison without forecasts: nothing to draw")
-    futures = [joint_mode(forecast, by_probability(forecast)[0], name) for name, forecast in forecasts.items()]
-    return _picture(scene, futures, path, "")
-
-
-def _picture(scene: Scene, futures: Sequence[JointMode], path: str | Path, title: str) -> Path:
     view = SceneView.of(scene)
+    futures = [joint_mode(forecast, by_probability(forecast)[0], name) for name, forecast in forecasts.items()]
+    return _picture(view, futures, path, "")
+
+
+def _picture(view: SceneView, futures: Sequence[JointMode], path: str | Path, title: str) -> Path:
+    if Path(path).suffix.lower() != ".png":
+        raise ValueError(f"{path}: a picture is written as a PNG, so its name must end in .png")
     futures = [view.turned(future) for future in futures]
     with style():
         figure, panels = layout(view, futures, title)

@@ -7,6 +7,7 @@ import re
 import shlex
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 
 from epo_lightning.checks import is_number
 from epo_lightning.registry import ConfigError
@@ -16,6 +17,8 @@ from epo_lightning.report.runs import EvaluatedRun, data_option
 
 SEARCHED = ("optimizer", "backbone", "forecaster")
 """Sections whose settings are searched for the best value, like :data:`BATCH`; others are varied for comparison."""
+OF_MACHINE = ("data.root", "data.workers")
+"""Words about data that say where and how they are made, and not what they are."""
 FROZEN = "forecaster.frozen"
 """Path of the run that a refinement refines: another one for every seed, so that it belongs to no setting."""
 
@@ -30,7 +33,7 @@ class BestSetting:
         overrides: those of its searched settings, and of options and settings that the command of the search fixed.
         words: words of a command line that train with it: ``experiment=rpi/v_lstm optimizer.lr=0.0005``.
         compared: runs and scores of all settings compared, the best one included.
-        left_out: labels of settings that lack seeds or have no finite score.
+        left_out: the other settings, which lack seeds or have no finite score.
     """
 
     row: Row
@@ -38,7 +41,7 @@ class BestSetting:
     overrides: tuple[str, ...]
     words: str
     compared: tuple[Row, ...]
-    left_out: tuple[str, ...]
+    left_out: tuple[Row, ...]
 
     @property
     def title(self) -> str:
@@ -83,8 +86,9 @@ def at_edge(best: BestSetting) -> list[str]:
     """Notes on numbers of the best setting that are the smallest or the largest of three or more that were tried."""
     notes = []
     for key, value in best.row.settings.items():
-        tried = {row.settings[key] for row in best.compared if is_number(row.settings.get(key))}
-        if not _is_searched(key) or len(tried) < 3 or value not in (min(tried), max(tried)):
+        values = [row.settings.get(key, math.nan) for row in (*best.compared, *best.left_out)]
+        tried: set[float] = {number for number in values if is_number(number) and math.isfinite(number)}
+        if not (_is_searched(key) and is_number(value) and len(tried) > 2 and value in (min(tried), max(tried))):
             continue
         which, other = ("largest", "larger") if value == max(tried) else ("smallest", "smaller")
         if value != 0:
@@ -114,7 +118,7 @@ def _best(runs: list[EvaluatedRun], rows: list[Row], metric: str) -> BestSetting
             f"no setting of {rows[0].title!r} has finite scores for all seeds {sorted(seeds)}: finish the search first"
         )
     best = min(whole, key=lambda row: (row.cells[metric].mean, natural(row.settings)))
-    left_out = tuple(row.name for row in rows if row not in whole)
+    left_out = tuple(row for row in rows if row not in whole)
     overrides = _overrides(best)
     words = " ".join(shlex.quote(word) for word in (*_row(best.runs[0], overrides), *overrides))
     return BestSetting(best, metric, overrides, words, tuple(whole), left_out)
@@ -154,9 +158,15 @@ def _row(run: EvaluatedRun, overrides: Iterable[str]) -> list[str]:
     if not run.experiment:
         parts = {"data": data_option(run.config["data"]), "backbone": run.backbone, "forecaster": run.forecaster}
         return [f"{group}={option}" for group, option in parts.items() if group not in chosen]
-    given = [word for word in shlex.split(run.command) if re.match(r"\+*data[.=]", word) and _key(word) not in chosen]
-    hard = [f"data={data_option(run.config['data'])}"] if run.config["data"].get("split") == "hard" else []
-    return [f"experiment={run.experiment}", *(given or hard)]
+    given = {
+        _key(word): word
+        for before, word in pairwise(["", *shlex.split(run.command)])
+        if re.match(r"\+*data[.=]", word) and before != "--config-dir" and _key(word) not in (*chosen, *OF_MACHINE)
+    }
+    section = run.config["data"]
+    if "data" not in given and (given or section.get("split") == "hard"):
+        given = {"data": f"data={data_option(section)}", **given}
+    return [f"experiment={run.experiment}", *given.values()]
 
 
 def _key(override: str) -> str:

@@ -200,6 +200,18 @@ def test_a_check_without_the_data_says_in_one_line_what_is_missing(
         ),
         (
             "experiment/mine.yaml",
+            "# @package _global_\ndefaults: [rpi/v_lstm, {backbone: hivt}]",
+            "experiment=mine",
+            r"write `- override /backbone: hivt`; did you mean 'hivt_m'",
+        ),
+        (
+            "experiment/mine.yaml",
+            "# @package _global_\ndefaults: [rpi/v_lstm, {hydra/launcher: joblib}]",
+            "experiment=mine",
+            r"write `- override /hydra/launcher: joblib`",
+        ),
+        (
+            "experiment/mine.yaml",
             "# @package _global_\ndefaults: [rpi/v_lstn, _self_]",
             "experiment=mine",
             r"in the defaults list of /.*experiment/mine\.yaml, .*: unknown option experiment=rpi/v_lstn: .* 'rpi/v_lstm'",

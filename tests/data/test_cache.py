@@ -94,6 +94,13 @@ def with_broken_manifest(folder):
     return "manifest.json is not a readable manifest"
 
 
+def with_a_broken_entry(folder):
+    path = folder / "manifest.json"
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps({**content, "files": {**content["files"], "test.safetensors": {}}}))
+    return "manifest.json is not a readable manifest"
+
+
 def of_another_format(folder):
     path = folder / "manifest.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "format": 99}))
@@ -115,6 +122,7 @@ def with_another_configuration(folder):
         deleted,
         without_manifest,
         with_broken_manifest,
+        with_a_broken_entry,
         of_another_format,
         with_another_configuration,
     ],

@@ -127,9 +127,16 @@ def test_a_score_of_fewer_seeds_than_the_row_says_their_number(tmp_path: Path) -
     assert to_markdown(further).splitlines()[-1] == "| V-LSTM + EPO | 3 | 0.300 ± 0.141 (n=2) |"
     assert "(n=2)" in to_latex(further)
     assert "n=2" in printed(further)
-    assert "with their number in the cell" in legend([further])
+    assert legend([further]).endswith("over n seeds. A cell with n=... is of those seeds alone that have the score.")
     assert "n=" not in to_markdown(main)
-    assert "with their number" not in legend([main])
+    assert "of those seeds alone" not in legend([main])
+
+
+def test_the_legend_of_one_seed_of_several_begins_with_a_sentence(tmp_path: Path) -> None:
+    for seed, own in enumerate(({"own/near": 0.2}, {})):
+        make_run(tmp_path / str(seed), "V-LSTM + EPO", "epo", scores(0.1) | own, seed=seed)
+    _, further = build_tables(collect(tmp_path))
+    assert legend([further]) == "A cell with n=... is of those seeds alone that have the score."
 
 
 def test_markdown_titles_are_escaped(tmp_path: Path) -> None:

@@ -295,3 +295,13 @@ def test_missing_forecasts_several_scenes_and_absent_agents_are_refused(tmp_path
     with pytest.raises(ValueError, match="without an observed agent"):
         draw(nobody, predicted, tmp_path / "no.png")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_picture_is_a_png_of_one_scene(tmp_path: Path) -> None:
+    scene = traffic()
+    with pytest.raises(ValueError, match=r"scene\.gif: a picture is written as a PNG"):
+        draw(scene, forecast(scene), tmp_path / "scene.gif")
+    for rows in ([], [0, 0]):
+        with pytest.raises(ValueError, match=f"a picture shows one scene, not {len(rows)}"):
+            draw(scene[rows], forecast(scene)[rows], tmp_path / "scene.png")
+    assert not list(tmp_path.iterdir())

@@ -90,7 +90,16 @@ def test_a_best_value_at_the_edge_of_those_tried_is_noted(tmp_path: Path) -> Non
     search(tmp_path / "inside", {(lr, 64): [error] for lr, error in ((0.001, 0.3), (0.002, 0.1), (0.004, 0.2))})
     search(tmp_path / "two", {(0.001, 64): [0.2], (0.002, 64): [0.1]})
     search(tmp_path / "zero", {(lr, 64): [0.1 + lr] for lr in (0.0, 0.1, 0.2)})
-    assert [at_edge(*best(tmp_path / name)) for name in ("inside", "two", "zero")] == [[], [], []]
+    diverged = {(lr, 64): [error] for lr, error in ((0.001, 0.3), (0.002, 0.2), (0.004, 0.1), (0.008, math.nan))}
+    search(tmp_path / "diverged", diverged)
+    assert [at_edge(*best(tmp_path / name)) for name in ("inside", "two", "zero", "diverged")] == [[], [], [], []]
+
+
+def test_words_about_a_machine_are_no_part_of_the_best_setting(tmp_path: Path) -> None:
+    words = "--config-dir data=x experiment=rpi/v_lstm data.root=/cache data.workers=4 data.share=0.1 data.share=0.5"
+    searched(tmp_path, words, **{"data.split": "hard"})
+    (found,) = best(tmp_path)
+    assert found.words == "experiment=rpi/v_lstm data=rpi_hard data.share=0.5 optimizer.lr=0.002"
 
 
 def test_the_test_split_never_chooses(tmp_path: Path) -> None:
@@ -110,7 +119,7 @@ def test_a_lucky_seed_and_a_failed_training_do_not_win(tmp_path: Path) -> None:
     search(tmp_path, {(0.001, 64): [0.3, 0.3], (0.01, 64): [0.1], (0.1, 64): [math.nan, 0.1]})
     (found,) = best(tmp_path)
     assert found.words == "experiment=rpi/v_lstm optimizer.lr=0.001"
-    assert (found.candidates, found.left_out) == (1, ("V-LSTM, lr=0.01", "V-LSTM, lr=0.1"))
+    assert (found.candidates, [row.name for row in found.left_out]) == (1, ["V-LSTM, lr=0.01", "V-LSTM, lr=0.1"])
 
 
 def test_an_unfinished_search_chooses_nothing(tmp_path: Path) -> None:
@@ -178,7 +187,7 @@ def test_settings_that_a_search_fixes_belong_to_the_best_setting(tmp_path: Path)
         )  # fmt: skip
     (found,) = best(tmp_path)
     chosen = "backbone.width=64 data.batch_size=16 ++optimizer.clip=0.5 optimizer.lr=0.002"
-    assert found.words == f"experiment=rpi/v_lstm data.placements=8 {chosen}"
+    assert found.words == f"experiment=rpi/v_lstm data=rpi data.placements=8 {chosen}"
     assert found.overrides == tuple(chosen.split())
 
 

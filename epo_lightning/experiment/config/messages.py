@@ -197,11 +197,12 @@ def _missing_option(instance: Hydra, missing: str, message: str) -> str:
             f"begins with the line `name: {option}`; a folder of your own is searched with --config-dir <folder>. "
             f"{_known(option, options)}"
         )
-    part, _, choice = option.partition("/")
-    if group == "experiment" and choice and options_of(instance, part):
+    part, _, choice = option.rpartition("/")
+    if group == "experiment" and part and (known := options_of(instance, part)):
+        advice = "" if choice in known else f"; {_known(choice, known)}"
         return (
             f"unknown option {group}={option}: if it stands in the defaults list of an experiment, write "
-            f"`- override /{part}: {choice}`"
+            f"`- override /{part}: {choice}`{advice}"
         )
     if (file := Path("conf") / group / f"{option}.yaml").is_file():
         return f"unknown option {group}={option}: {file} is found with the option --config-dir conf"

@@ -73,7 +73,8 @@ def work(sweep: Sweep, config: Mapping[str, Any], overrides: Sequence[str], opti
     try:
         if not record["jobs"]:
             sweep.add(job_of(config, overrides))
-        training.train(dict(config), [*overrides, *options], name=names_of(sweep.jobs).get(run.path, ""))
+        names = {path.resolve(): name for path, name in names_of(sweep.jobs).items()}
+        training.train(dict(config), [*overrides, *options], name=names.get(run.path.resolve(), ""))
     except Exception as error:
         message = mask(kind_and_message(error))
         message = message.replace(f"{sweep.root}{os.sep}", f"{os.path.relpath(sweep.root)}{os.sep}")

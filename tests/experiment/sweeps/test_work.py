@@ -36,3 +36,10 @@ def test_a_worker_with_a_cache_of_its_own_keeps_it(epo: Epo, tmp_path: Path, mon
     monkeypatch.setenv("EPO_CACHE", str(tmp_path / "of this machine"))
     work(the_sweep(), job.run.config(), job.overrides, ())
     assert os.environ["EPO_CACHE"] == str(tmp_path / "of this machine")
+
+
+def test_lines_about_a_run_name_the_settings_in_which_it_differs(epo: Epo, capsys: pytest.CaptureFixture[str]) -> None:
+    shown = ("callbacks.progress=lines" if word == "callbacks.progress=none" else word for word in TINY)
+    assert epo("sweep", "rpi_main", *shown, "seed=0", "experiment=rpi/v_lstm", "backbone.width=16,32") == 0
+    begun = [line for line in capsys.readouterr().out.splitlines() if "at most" in line]
+    assert [line.partition(":")[0] for line in begun] == ["V-LSTM, width=16, seed 0", "V-LSTM, width=32, seed 0"]
