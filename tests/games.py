@@ -14,8 +14,8 @@ from epo_lightning.game.features import OWN_FEATURES, PAIR_FEATURES
 from epo_lightning.scene import Scene
 from epo_lightning.solvers.gauss_newton.expansion import expand
 
-BOUNDS = {"vel": (-0.05, 0.6), "acc": (-0.3, 0.3), "turnr": (-0.2, 0.2), "jerk": (-1.0, 1.0), "turnacc": (-1.0, 1.0)}
-"""Bounds that random controls leave."""
+BOUNDS = {"vel": (-0.05, 0.6), "acc": (-0.3, 0.3), "turnr": (-0.2, 0.2), "jerk": (-1.0, 1.0), "turnacc": (-0.8, 1.2)}
+"""Bounds that random controls leave; no two signals have the same."""
 ALL = tuple(OWN_FEATURES)
 """Every built-in own feature."""
 EXID = ("goal", "lane", "velref", "vel", "acc", "jerk", "steer", "turnr", "turnacc")
