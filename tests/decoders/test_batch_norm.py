@@ -47,17 +47,32 @@ def test_statistics_of_present_rows_need_no_selection(kind, filling, present, mo
         torch.testing.assert_close(one, other, rtol=0, atol=1e-10)
 
 
-@pytest.mark.parametrize("kind", ["selection", "operations", pytest.param("kernels", marks=needs_warp)])
-def test_a_batch_without_a_present_row_leaves_the_statistics_as_they_are(kind, monkeypatch):
+def normalisation(kind, monkeypatch):
+    """A module whose running mean is 5 and whose running variance is 3."""
     norm = MaskedBatchNorm(3).double().train()
     norm.running_mean.fill_(5.0)
     norm.running_var.fill_(3.0)
     monkeypatch.setattr(batch_norm, "readable", lambda _: kind == "selection")
     if kind == "kernels":
         monkeypatch.setattr(MaskedBatchNorm, "_without_waiting", MaskedBatchNorm._fused)
+    return norm
+
+
+@pytest.mark.parametrize("kind", ["selection", "operations", pytest.param("kernels", marks=needs_warp)])
+def test_a_batch_without_a_present_row_leaves_the_statistics_as_they_are(kind, monkeypatch):
+    norm = normalisation(kind, monkeypatch)
     norm(torch.randn(2, 4, 3, dtype=torch.float64), torch.zeros(2, 4, dtype=torch.bool))
     assert norm.running_mean.tolist() == 3 * [5.0]
     assert norm.running_var.tolist() == 3 * [3.0]
+    assert norm.num_batches_tracked == 1, "as by nn.BatchNorm1d"
+
+
+@pytest.mark.parametrize("kind", ["operations", pytest.param("kernels", marks=needs_warp)])
+def test_one_present_row_has_a_variance_of_zero(kind, monkeypatch):
+    norm = normalisation(kind, monkeypatch)
+    norm(torch.full((1, 2, 3), 7.0, dtype=torch.float64), torch.tensor([[False, True]]))
+    torch.testing.assert_close(norm.running_mean, torch.full((3,), 5.2, dtype=torch.float64))
+    torch.testing.assert_close(norm.running_var, torch.full((3,), 2.7, dtype=torch.float64))
 
 
 def given_rows(rows=5, features=3, dtype=torch.float64):
