@@ -66,7 +66,7 @@ def test_games_of_different_lengths_are_those_of_pytorch(pair, agents, threads, 
 def test_agents_with_infinite_damping_keep_their_controls_exactly():
     scene, energy = random_scene(3, 4, history=2, size=2.0, dtype=torch.float64), FeatureEnergy(ALL, bounds=BOUNDS)
     game = random_game(scene, 2, 6)
-    damping = torch.where(torch.arange(4) == 1, torch.inf, 1.0).to(torch.float64).expand(3, 2, 4)
+    damping = torch.where(torch.arange(4) == 1, torch.inf, 1.0 + torch.rand(3, 2, 4, dtype=torch.float64))
     found = assert_same_as_pytorch(energy, scene, game, damping)
     assert torch.equal(found.controls[:, :, 1], game.initial_controls[:, :, 1])
     assert not torch.equal(found.controls[:, :, 0], game.initial_controls[:, :, 0])
@@ -116,11 +116,11 @@ def test_the_backend_warp_takes_the_steps_of_the_layer():
         found = LevenbergMarquardt(4, 1.0, 1.0, adaptive=adaptive, backend="warp")(energy, scene, game)
         expected = LevenbergMarquardt(4, 1.0, 1.0, adaptive=adaptive, backend="pytorch")(energy, scene, game)
         torch.testing.assert_close(found.controls, expected.controls, rtol=0, atol=1e-9)
-    reference = game.reference.clone()
-    reference[1, 0, 1] = 99
-    game, energy = dataclasses.replace(game, reference=reference), FeatureEnergy(["lane", "acc", "turnr"])
-    solution = warp.solve(energy, scene, game, 2, 0.3, torch.full((3, 2), 10.0, dtype=torch.float64))
-    assert solution.status.tolist() == [[0, 0], [Status.STOPPED, 0], [0, 0]], "a line that does not exist"
+    energy = FeatureEnergy(["lane", "acc", "turnr"])
+    for line in (2, 99, -1):
+        game.reference[1, 0, 1] = line
+        solution = warp.solve(energy, scene, game, 2, 0.3, torch.full((3, 2), 10.0, dtype=torch.float64))
+        assert solution.status.tolist() == [[0, 0], [Status.STOPPED, 0], [0, 0]], "a line that does not exist"
 
 
 def test_games_that_the_kernels_do_not_solve_are_refused(monkeypatch):
@@ -134,6 +134,10 @@ def test_games_that_the_kernels_do_not_solve_are_refused(monkeypatch):
     assert "up to 8 agents, not 9" in warp.obstacle(FeatureEnergy(["acc"]), wide, random_game(wide, own=("acc",)))
     monkeypatch.setattr(warp, "LONGEST", 2 * game.initial_controls.numel() - 1)
     assert "this batch has too many: split it" in warp.obstacle(FeatureEnergy(["acc"]), scene, game)
+    lines = dataclasses.replace(scene, references=scene.references.repeat(1, 1, 1, 5, 1))
+    monkeypatch.setattr(warp, "LONGEST", 2 * game.initial_controls.numel())
+    assert "this batch has too many: split it" in warp.obstacle(FeatureEnergy(["lane"]), lines, game)
+    assert warp.obstacle(FeatureEnergy(["acc"]), lines, game) is None
     monkeypatch.undo()
     assert "not torch.float16" in warp.obstacle(FeatureEnergy(["acc"]), scene, game.to(torch.float16))
     with pytest.raises(ValueError, match=r"no Newton steps; 'compiled', 'host' .on a GPU. and 'pytorch' have them"):
