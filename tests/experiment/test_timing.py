@@ -97,16 +97,23 @@ def test_many_scenes_are_timed_and_none_while_caches_settle(
     clock, scenes = [0.0], []
 
     def settle(_: Forecaster, scene: epo_lightning.Scene) -> None:
-        """The first forecasts take seconds, and the others 1, 2, 3 .. ms by a clock of the test."""
+        """The first forecasts take seconds, and the others 1, 4, 9 .. us by a clock of the test: mean and median differ."""
         scenes.append(tuple(scene.current.flatten().tolist()))
         counted = len(scenes) - timing.WARM_UP
-        clock[0] += 0.001 * counted if counted > 0 else 9.0
+        clock[0] += 1e-6 * counted**2 if counted > 0 else 9.0
 
     opened_with(monkeypatch, run, settle)
     monkeypatch.setattr(timing, "time", SimpleNamespace(perf_counter=lambda: clock[0]))
     seconds = measure(run, read(Settings, run.config()))["seconds"]
-    assert seconds == pytest.approx({"mean": 0.0505, "median": 0.0505, "p10": 0.0109, "p90": 0.0901})
+    assert seconds == pytest.approx({"mean": 3383.5e-6, "median": 2550.5e-6, "p10": 118.9e-6, "p90": 8118.1e-6})
     assert len(set(scenes)) > 10
+
+
+def test_times_on_a_cpu_are_those_of_a_cpu_also_where_there_is_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert timing._device("cpu", 1) == torch.device("cpu")
+    assert timing._device("auto", 1) == torch.device("cuda", 0)
+    assert timing._device("gpu", [3]) == torch.device("cuda", 3)
 
 
 def test_an_untrained_run_has_a_complete_run_folder(untrained: RunFolder, epo: Epo) -> None:
