@@ -218,6 +218,26 @@ def test_differences_are_relative_for_large_values_and_nan_is_one() -> None:
     assert not largest_difference(lambda given: {"x": given["x"] * torch.nan}, given, given) <= 1e-5
 
 
+@pytest.mark.parametrize("difference", [0.0, 2e-5, torch.nan])
+def test_a_program_that_differs_from_its_forecaster_is_not_written(
+    difference: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("EPO_CACHE", str(tmp_path / "cache"))
+    here = "epo_lightning.experiment.export."
+    form = replace(FORMATS["pt2"], write=lambda program, about, path: path.touch(), load=lambda path: None)
+    monkeypatch.setattr(f"{here}FORMATS", {"pt2": form})
+    monkeypatch.setattr(f"{here}program_of", lambda *_: None)
+    monkeypatch.setattr(f"{here}describe", lambda _: {})
+    monkeypatch.setattr(f"{here}largest_difference", lambda *_: difference)
+    settings = ExportSettings(run="rpi/v_lstm_sc", out=str(tmp_path / "new" / "it.pt2"))
+    if difference == 0.0:
+        assert export(settings) == (tmp_path / "new" / "it.pt2", 0.0)
+        return
+    with pytest.raises(ConfigError, match=rf"differs from its forecaster by {difference:.2g}: it is not written"):
+        export(settings)
+    assert not list((tmp_path / "new").iterdir())
+
+
 def test_values_are_not_readable_on_other_devices_and_while_a_program_is_exported() -> None:
     assert readable(torch.zeros(1))
     assert not readable(torch.zeros(1, device="meta"))

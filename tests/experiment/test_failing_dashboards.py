@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import queue
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -103,6 +105,8 @@ def test_the_runs_of_a_sweep_are_a_group(epo: Epo, bad: type[Bad]) -> None:
         with logs.open_logs(read(Settings, now), now, run) as (_, logger):
             told = logger.dashboard.facts
         assert (told.group, told.name) == ("ours", "V-LSTM + SC (seed 0)")
+    began = "".join(filter(str.isdigit, run.record["began"]))
+    assert told.id == f"{run.record['identity']}-{began}", "a run that begins anew would continue an old curve"
     assert told.parameters()["optimizer.lr"] == 1e-3
 
 
@@ -138,6 +142,28 @@ def test_a_slow_dashboard_gets_every_row_in_order_and_costs_the_run_nothing(tmp_
     assert [step for step, _ in dashboard.told] == list(range(2000))
     assert dashboard.ended == Ending(summary={"best/a": 1.0})
     assert logger.off is None
+
+
+def test_rows_are_collected_for_some_seconds_also_if_new_ones_never_end(
+    bad: type[Bad], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A row arrives every second by a clock of the test, and the dashboard wants those of three seconds together."""
+    monkeypatch.setattr(bad, "where", "open")
+    monkeypatch.setattr(bad, "how", "hangs")
+    monkeypatch.setattr(bad, "every", 3.5)
+    clock = [0]
+    logger = Aside(Bad(facts(tmp_path)))
+
+    def get(timeout: float | None) -> Row:
+        if timeout is not None and timeout < 1.0:
+            raise queue.Empty
+        clock[0] += 1
+        assert clock[0] < 10, "the rows wait for the end of the run"
+        return clock[0], {}
+
+    monkeypatch.setattr(aside, "time", SimpleNamespace(monotonic=lambda: float(clock[0])))
+    monkeypatch.setattr(logger, "_queue", SimpleNamespace(get=get))
+    assert logger._waiting() == ([(1, {}), (2, {}), (3, {}), (4, {})], None)
 
 
 def test_an_evaluation_sends_missed_values_to_the_dashboard_again(

@@ -56,6 +56,7 @@ def test_a_follower_of_a_finished_run_waits_for_no_leader(tmp_path: Path, monkey
     def nobody(*_: object, **__: object) -> None:
         raise dist.DistNetworkError("refused")
 
+    monkeypatch.setattr(follower, "PATIENCE", 0.0)
     monkeypatch.setattr(follower.dist, "TCPStore", nobody)
     run = RunFolder(tmp_path)
     run.path.mkdir(exist_ok=True)

@@ -18,7 +18,7 @@ from epo_lightning.data.cache import file_digest
 from epo_lightning.experiment import ship as shipping
 from epo_lightning.experiment.card import SCORES, Recipe, card, recipe_of, recipes
 from epo_lightning.experiment.config.compose import compose
-from epo_lightning.experiment.ship import SCENES, score_examples, ship
+from epo_lightning.experiment.ship import PLACES, SCENES, score_examples, ship, shrunk
 from epo_lightning.files import read_json
 from epo_lightning.registry import ConfigError
 from epo_lightning.run_folder import RunFolder
@@ -176,6 +176,8 @@ def test_a_packed_run_forecasts_like_the_run(
     assert (folder / "checkpoints" / "best.ckpt").stat().st_size * 2 < (
         tmp_path / "one/checkpoints/best.ckpt"
     ).stat().st_size
+    config = RunFolder(folder).config()
+    assert {key: config[key] for key in PLACES} == PLACES, "folders of the machine on which the run was made"
     shipped = pretrained.HOME / ROW
     assert sorted(path.name for path in folder.iterdir()) == sorted(path.name for path in shipped.iterdir())
     scores = [read_json(path / "metrics.json")["metrics"]["minSADE"] for path in (tmp_path / "one", folder)]
@@ -190,6 +192,15 @@ def test_a_packed_run_forecasts_like_the_run(
     half = epo_lightning.load(folder / "checkpoints" / "best.ckpt").predict(scenes).states
     assert 0 < float((half - one.predict(scenes).states).abs().max()) < 0.05
     assert read_json(folder / "metrics.json")["metrics"]["minSADE"] != scores[0]
+
+
+def test_numbers_that_count_keep_their_type_where_weights_are_stored_in_half_precision() -> None:
+    weights = {"w": torch.rand(4), "batches": torch.tensor(70_001), "mask": torch.tensor([True])}
+    assert shrunk(weights) == weights
+    large = {**weights, "w": torch.rand(shipping.LARGEST)}
+    types = {name: value.dtype for name, value in shrunk(large).items()}
+    assert types == {"w": torch.float16, "batches": torch.int64, "mask": torch.bool}
+    assert shrunk(large)["batches"] == 70_001
 
 
 def test_a_forecaster_that_cannot_be_replaced_is_kept(

@@ -115,6 +115,16 @@ def test_only_equal_scores_of_the_same_data_share_a_file(tmp_path: Path) -> None
     assert "truth" not in read_json(first)
 
 
+def test_scores_of_another_checkpoint_are_not_those_of_the_run_also_if_it_has_none(tmp_path: Path) -> None:
+    run, checkpoint = RunFolder(tmp_path), tmp_path / "last.ckpt"
+    checkpoint.write_bytes(b"weights")
+    file = keep(
+        run, {"split": "test", "data_digest": "a", "checkpoint": "last", "metrics": {"minSADE": 1.0}}, checkpoint
+    )
+    assert file.name.startswith("scores-test-last-")
+    assert not run.metrics_file().exists()
+
+
 def test_every_record_counts_once_with_the_weight_of_its_own_game() -> None:
     """Scenes of an executed and an alternative future, in another order than the records of the split."""
     weights = torch.tensor([10.0, 40.0, 90.0, 160.0])

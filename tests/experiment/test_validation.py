@@ -9,12 +9,15 @@ from typing import Any
 
 import pytest
 import torch
+from experiment import tiny
 from experiment.conftest import TINY, Epo
 
-from epo_lightning.experiment import assembly, callbacks
+from epo_lightning.experiment import assembly, callbacks, evaluate
 from epo_lightning.experiment.config.compose import compose
 from epo_lightning.experiment.config.settings import Settings
+from epo_lightning.experiment.opening import open_checkpoint
 from epo_lightning.files import read_json
+from epo_lightning.forecasters.checkpoint import read_checkpoint
 from epo_lightning.forecasters.step_means import StepMeans
 from epo_lightning.metrics.forecast import EQUILIBRIUM_METRICS
 from epo_lightning.run_folder import RunFolder, read_log
@@ -62,6 +65,50 @@ def test_a_run_is_scored_by_its_best_checkpoint(epo: Epo) -> None:
     scored = read_json(run.metrics_file("val"))
     assert scored["checkpoint"] == "best"
     assert scored["metrics"]["minSADE"] == pytest.approx(min(scores), rel=1e-5)
+
+
+def test_the_best_checkpoint_has_the_weights_of_its_validation_also_within_an_epoch(epo: Epo) -> None:
+    words = ("optimizer.lr=0.05", "trainer.limit_val_batches=1.0", "trainer.validate_steps=3")
+    assert epo(*WORDS, *words, "run_dir=run") == 0
+    run = RunFolder(Path("run"))
+    rows = read_log(run.logs / "metrics.csv")
+    scores = {int(row["step"]) + 1: float(row["val/minSADE"]) for row in rows if row.get("val/minSADE")}
+    best = min(scores, key=lambda step: scores[step])
+    assert best % 4, "the best validation is that of the end of an epoch"
+    assert read_checkpoint(run.checkpoint("best"))["global_step"] == best
+
+
+def test_an_evaluation_draws_from_the_seed_of_the_run_whatever_was_drawn_before(
+    epo: Epo, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A forecaster may draw its forecasts; its scores must not depend on the runs that are scored before it."""
+    assert epo("train", "experiment=rpi/const_vel", *TINY, "seed=3", "run_dir=run") == 0
+    drawn: list[float] = []
+
+    def opened(*words: Any) -> Any:
+        forecaster = open_checkpoint(*words)
+        forecaster.register_forward_pre_hook(lambda *_: drawn.append(torch.rand(1).item()))
+        return forecaster
+
+    monkeypatch.setattr(evaluate, "open_checkpoint", opened)
+    for before in (1, 2):
+        torch.manual_seed(before)
+        assert epo("evaluate", "run=run", "batch_size=16") == 0
+    assert len(drawn) == 2 * 4, "four batches each"
+    assert drawn[:4] == drawn[4:]
+    torch.manual_seed(3)
+    assert drawn[0] == torch.rand(1).item()
+
+
+def test_true_costs_are_those_of_the_games_that_are_scored(epo: Epo, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+    monkeypatch.setattr(evaluate, "RPIData", tiny.Tiny)
+    monkeypatch.setattr(tiny.Tiny, "records", lambda _, split: {"weight": split}, raising=False)
+    monkeypatch.setattr(evaluate, "TruthTest", asked.append)
+    assert epo("train", "experiment=rpi/const_vel", *TINY, "run_dir=run") == 0
+    for split in ("val", "test"):
+        assert epo("evaluate", "run=run", f"split={split}") == 0
+    assert asked == ["val", "test"]
 
 
 def test_the_equilibrium_of_games_is_measured_in_tests_and_not_in_validations(epo: Epo) -> None:

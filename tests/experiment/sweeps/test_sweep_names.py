@@ -183,13 +183,13 @@ def test_runs_on_two_data_sets_are_named_by_their_data() -> None:
     assert list(names_of(again).values())[-1] == "JFP (rpi), seed 0 (s0-abc)"
 
 
-def test_a_sweep_over_two_data_sets_records_their_names(tmp_path: Path) -> None:
+def test_a_sweep_over_two_data_sets_records_their_names_and_seeds(tmp_path: Path) -> None:
     rows = ("table1/rpi_jfp", "table1/highway_jfp")
-    words = [["data=drawn", "budget=smoke", f"experiment={row}"] for row in rows]
+    words = [["data=drawn", "budget=smoke", f"experiment={row}", f"seed={3 + i}"] for i, row in enumerate(rows)]
     sweep = Sweep(tmp_path / "sweeps" / "table1")
     sweep.begin("table1", "epo sweep table1", [], [job_of(compose("train", word), word) for word in words], False)
     names = list(names_of(sweep.jobs).values())
-    assert names == ["JFP (drawn (rpi)), seed 0", "JFP (drawn (highway)), seed 0"]
+    assert names == ["JFP (drawn (rpi)), seed 3", "JFP (drawn (highway)), seed 4"]
 
 
 def test_labels_depend_on_the_settings_and_not_on_the_machine() -> None:
