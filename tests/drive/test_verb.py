@@ -256,7 +256,7 @@ def test_results_are_not_overwritten(
     assert "holds results already" in capsys.readouterr().err
 
 
-def test_every_setting_that_decides_on_episodes_has_a_folder_of_its_own() -> None:
+def test_every_setting_that_decides_on_episodes_has_a_folder_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     one = DriveSettings(run="rpi/v_lstm_epo", ways="own", others="plays")
     assert (one.run, one.ways, one.others) == (["rpi/v_lstm_epo"], ["own"], ["plays"])
     assert folder_of(dataclasses.replace(one, timed=0, film=None)) == folder_of(one)
@@ -265,6 +265,11 @@ def test_every_setting_that_decides_on_episodes_has_a_folder_of_its_own() -> Non
     for change in ({"seed": 1}, {"episodes": 7}, {"others": ["ignores"]}, {"run": ["rpi/v_lstm_sc"]}):
         assert folder_of(dataclasses.replace(one, **change)) != folder_of(one)
     assert folder_of(dataclasses.replace(one, out="mine")) == Path("mine")
+    before, traffic = folder_of(one), dataclasses.replace(one, world="highway_env")
+    elsewhere = folder_of(traffic)
+    monkeypatch.setattr(drive, "RECIPE", drive.RECIPE + 1)
+    assert folder_of(one) != before, "games of another version are other episodes"
+    assert folder_of(traffic) == elsewhere
 
 
 def test_differences_are_those_of_the_first_planner_from_the_others_in_the_same_episodes() -> None:

@@ -131,6 +131,24 @@ def test_a_row_that_failed_on_a_full_disk_is_written_later(run: RunFolder, monke
     assert steps(run) == [0, 1, 2, 3, 4]
 
 
+def test_a_disk_that_is_full_when_a_column_is_added_keeps_the_rows(run: RunFolder) -> None:
+    import resource
+
+    write(run, 4)
+    log = CSVLog(run, 1, continued_from=4)
+    before = (run.logs / "metrics.csv").read_bytes()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before), hard))  # the file is replaced by a larger one
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            log.log_metrics({"another": 5.0}, 4)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert (run.logs / "metrics.csv").read_bytes() == before
+    log.save()
+    assert steps(run) == [0, 1, 2, 3, 4]
+
+
 def test_the_file_is_plain_csv_with_sorted_columns(run: RunFolder) -> None:
     log = CSVLog(run, flush=2)
     log.log_metrics({"b": torch.tensor(0.5), "step name, quoted": 1.0}, 0)

@@ -296,6 +296,7 @@ def test_the_hash_of_the_code_is_that_of_the_files_on_which_results_depend(
     (package / "report" / "page.py").write_text("x = 2\n")
     (tmp_path / "elsewhere" / "unrelated.py").touch()
     (package / "backbones" / ".#mine.py").symlink_to("me@host.123")  # a lock of Emacs
+    (package / "backbones" / "._mine.py").write_text("x = 3\n")  # attributes that macOS keeps beside a file
     (package / "README.md").write_text("words")
     assert provenance.code.__wrapped__() == hashes[-1]
 

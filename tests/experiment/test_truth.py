@@ -44,6 +44,17 @@ def test_costs_of_the_true_game_are_the_true_ones_at_any_scale_and_sign(sign: fl
     )
 
 
+def test_costs_of_agents_with_other_weights_are_their_geometric_mean() -> None:
+    """A scale by which one agent's costs are multiplied and the other one's divided is none of the game."""
+    game = games(torch.tensor([10.0]).double(), torch.ones(1).double())
+    goal = torch.tensor([100.0, 900.0]).double().sqrt().expand(1, 2, 2)
+    found = truth.inferred_costs(
+        GameParameters({**game.own_weights, "goal": goal}, game.pair_weights, game.initial_controls),
+        torch.zeros(1).long(),
+    )
+    assert found["goal"].tolist() == pytest.approx([300.0])
+
+
 def test_scores_are_medians_of_relative_errors_and_a_rank_correlation() -> None:
     true = torch.tensor([10.0, 20.0, 40.0, 80.0]).double()
     wrong = {

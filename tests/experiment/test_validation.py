@@ -46,6 +46,13 @@ def test_a_training_is_validated_as_often_as_configured(epo: Epo, setting: str, 
     assert validated("run") == expected
 
 
+@pytest.mark.parametrize(("given", "epochs"), [("0", 0), ("3", 3), ("null", -1)])
+def test_zero_epochs_are_none_and_no_number_is_no_limit(given: str, epochs: int, tmp_path: Path) -> None:
+    words = ["experiment=rpi/v_lstm_sc", "data=drawn", f"trainer.max_epochs={given}", "trainer.max_steps=9"]
+    settings = read(Settings, compose("train", words))
+    assert assembly.build_trainer(settings.trainer, RunFolder(tmp_path), []).max_epochs == epochs
+
+
 @pytest.mark.parametrize(("least", "epochs"), [(0.0, 4), (100.0, 3)])
 def test_an_improvement_below_min_delta_is_none(epo: Epo, least: float, epochs: int) -> None:
     words = ("optimizer.lr=0.0001", "callbacks.patience=2", f"callbacks.min_delta={least}")

@@ -186,6 +186,15 @@ def test_mean_median_and_percentiles_of_times_stand_below_their_names(tmp_path: 
     assert listed["forecasts"] == "70"
 
 
+@pytest.mark.parametrize("least", [0.0, -0.001, float("inf")])
+def test_a_time_that_is_no_positive_number_is_left_out_with_a_note(least: float, tmp_path: Path) -> None:
+    """A chart of times has a logarithmic axis."""
+    measured = {"mean": 0.004, "median": 0.003, "p10": least, "p90": 0.009}
+    timings, (note,) = read_timings([timed(tmp_path, 3, 1, 5, 0.001, seconds=measured)])
+    assert timings == []
+    assert "seconds must be positive numbers" in note
+
+
 def test_captions_name_the_sizes_that_a_figure_does_not_vary(tmp_path: Path) -> None:
     for agents, steps, modes in ((2, 1, 3), (2, 6, 3), (5, 6, 3), (5, 6, 1)):
         timed(tmp_path, agents, steps, modes, 0.001 * agents)

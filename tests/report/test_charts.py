@@ -124,6 +124,14 @@ def test_rows_that_differ_in_more_than_steps_are_not_joined(tmp_path: Path) -> N
     assert steps_curves(distinct(build_tables(collect(tmp_path)))) == []
 
 
+def test_rows_with_other_seeds_are_points_of_one_curve(tmp_path: Path) -> None:
+    for steps, seed in ((1, 0), (2, 7)):
+        made = {"settings": {"solver.steps": steps}, "seed": seed}
+        make_run(tmp_path / str(steps), "V-LSTM + EPO", "epo", scores(0.1 * steps), **made)  # type: ignore[arg-type]
+    (curve,) = steps_curves(distinct(build_tables(collect(tmp_path))))
+    assert (curve.optimised.x, curve.optimised.mean) == ((1, 2), (0.1, 0.2))
+
+
 def test_rows_on_two_splits_have_curves_apart(tmp_path: Path) -> None:
     for steps, value in ((1, 0.3), (2, 0.2)):
         for split, more in (("test", 0.0), ("val", 0.5)):

@@ -111,3 +111,8 @@ def test_rows_with_too_long_labels_are_named_by_their_parts_or_their_identity() 
 def test_numbers_sort_as_numbers(values: list[Any]) -> None:
     settings = [{"solver.steps": value} for value in values]
     assert sorted([*settings[1:], settings[0]], key=natural) == settings
+
+
+def test_a_key_that_ends_like_a_longer_word_is_as_short_as_others() -> None:
+    keys = ["solver.steps", "solver.test_steps", "optimizer.lr", "scheduler.final_lr"]
+    assert list(short_keys(keys, {}).values()) == ["steps", "test_steps", "lr", "final_lr"]

@@ -15,7 +15,9 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
-from epo_lightning.report.page import picture_uri
+from epo_lightning.report.page import _behind, picture_uri
+from epo_lightning.report.runs import collect
+from epo_lightning.report.tables import build_tables
 from epo_lightning.report.write import Report, write_report
 
 from .page_runs import over_runtime, over_steps, rows_with_seeds
@@ -272,3 +274,12 @@ def test_pictures_are_reduced_and_remain_similar(tmp_path: Path) -> None:
     assert small.size == (1500, 150)
     red = np.asarray(small.convert("RGB"))[..., 0].astype(int)
     assert np.abs(red - np.linspace(0, 255, 1500)).max() < 12
+
+
+@pytest.mark.parametrize(("trained", "shown"), [("abc", ""), ("other", "other")])
+def test_details_name_the_data_of_a_training_that_are_not_those_of_the_test(
+    trained: str, shown: str, tmp_path: Path
+) -> None:
+    make_run(tmp_path / "run", "EPO", "epo", scores(0.1), digest="abc", trained_digest=trained)
+    (run,) = _behind(build_tables(collect(tmp_path))[0].rows[0])["runs"]
+    assert (run["digest"], run["trained"]) == ("abc", shown)

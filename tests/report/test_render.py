@@ -198,3 +198,9 @@ def test_signed_numbers_are_read_back(value: float) -> None:
 
 def test_small_p_values_are_not_printed_as_zero() -> None:
     assert [p_text(p) for p in (0.5, 0.0712, 0.001, 0.00099, 0.0)] == ["0.500", "0.071", "0.001", "< 0.001", "< 0.001"]
+
+
+def test_rows_are_ranked_by_the_relative_gap_and_by_no_number_in_units_of_their_own() -> None:
+    ranked = ("minSADE", "overlap_jfp", "nash_gap_relative")
+    own = ("nash_gap", "gradient_norm", "energy_solved", "pair_effect", "executed/pair_effect", "true_pair_rank")
+    assert [Column(metric, "").ranked for metric in (*ranked, *own)] == [True] * 3 + [False] * 6

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from epo_lightning.files import write_json
+from epo_lightning.files import read_json, write_json
 from epo_lightning.registry import ConfigError
 from epo_lightning.report.runs import read_parts
 from epo_lightning.report.transfer import labels_of, transfer_sheets, transfers, transfers_to_csv
@@ -65,6 +65,16 @@ def test_cells_are_means_over_seeds_by_training_and_test(tmp_path: Path) -> None
     assert sade.ends == {0, 1}
     assert tests.lines[1] == ("b, all", "car 75%, pedestrian 25%", "no map", "12", "3")
     assert tests.lines[0] == ("a, test", "-", "-", "-", "-")
+
+
+def test_validation_scores_have_no_column(tmp_path: Path) -> None:
+    runs = three_runs(tmp_path)
+    for run in runs:
+        content = read_json(run.metrics_file())
+        write_json(run.metrics_file("val"), {**content, "split": "val", "metrics": scores(0.1)})
+    sheet = transfer_sheets(transfers(runs))[0]
+    assert sheet.header[3:] == ("a, test", "b, all", "c, all")
+    assert all("0.100" not in line for line in sheet.lines)
 
 
 def test_the_csv_has_every_score(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from epo_lightning.registry import ConfigError
 from epo_lightning.report.columns import INTERACTIVE
 from epo_lightning.report.write import Report, write_report
 
-from .page_runs import over_runtime, over_steps, rows_with_seeds
+from .page_runs import over_runtime, over_steps, rows_with_seeds, timed
 from .run_folders import make_run, scores
 
 
@@ -230,3 +230,10 @@ def test_equal_runs_give_equal_bytes(tmp_path: Path) -> None:
 
 def test_the_subset_with_a_table_of_its_own_is_one_of_the_metrics() -> None:
     assert INTERACTIVE in SUBSETS
+
+
+def test_a_run_that_was_only_timed_hides_no_scores_of_others(tmp_path: Path) -> None:
+    timed(tmp_path, 4, 2, 5, 0.001)
+    assert Report.of_folder(tmp_path).evaluated == (), "times alone are worth a report"
+    make_run(tmp_path / "scored", "V-LSTM", "marginal", scores(0.3))
+    assert [run.metrics["minSADE"] for run in Report.of_folder(tmp_path).evaluated] == [0.3]

@@ -93,3 +93,18 @@ def test_times_of_another_device_are_measured_again(device: str, accelerator: st
     sweeping._set_aside(run, TrainerSettings(accelerator=accelerator, threads=1))
     aside = tmp_path / f"runtime-{'cpu' if device == 'cpu' else 'gpu'}-1.json"
     assert (run.metrics_file("time").is_file(), aside.is_file()) == (kept, not kept)
+
+
+def test_words_of_the_data_are_no_words_of_runs_and_drawn_scenes_are_not_made(
+    epo: Epo, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made: list[tuple[str, bool, int]] = []
+    monkeypatch.setattr(
+        sweeping, "make_data", lambda settings: made.append((settings.data["name"], settings.strict, settings.workers))
+    )
+    words = ("strict=false", "workers=3", "progress=false", "seed=0", "experiment=rpi/const_vel,rpi/v_lstm")
+    assert epo("sweep", "generate", "rpi_main", *words, "data=rpi") == 0
+    assert made == [("rpi", False, 3)], "once, although two rows have it"
+    assert epo("sweep", "generate", "rpi_main", *words, "data=drawn") == 0
+    assert len(made) == 1
+    assert "draws its scenes in memory: there is nothing to make" in capsys.readouterr().out
