@@ -53,12 +53,16 @@ def test_a_follower_trains_as_its_leader_does(monkeypatch: pytest.MonkeyPatch) -
 def test_a_follower_of_a_finished_run_waits_for_no_leader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A task of Slurm that starts again after the run has ended: its leader trains nothing and opens no store."""
 
-    def nobody(*_: object, **__: object) -> None:
+    searched = []
+
+    def no_store(*_: object, **__: object) -> None:
+        searched.append(True)
         raise dist.DistNetworkError("refused")
 
     monkeypatch.setattr(follower, "PATIENCE", 0.0)
-    monkeypatch.setattr(follower.dist, "TCPStore", nobody)
+    monkeypatch.setattr(follower.dist, "TCPStore", no_store)
     run = RunFolder(tmp_path)
     run.path.mkdir(exist_ok=True)
     run.record_file.write_text(json.dumps({"status": "finished"}))
     follower.follow(Place(1, 2, 1234), run)
+    assert searched == [True], "the store is searched once, and then the record of the run is read"
