@@ -138,5 +138,5 @@ def _pictures(settings: Settings, run: RunFolder, count: int) -> list[Path]:
         forecast = forecast_of(forecaster, scenes)
         return [path for path, _ in draw(request, settings.title, forecaster.task.shape, scenes, forecast)]
     except Exception as error:  # a run must not fail because a picture cannot be drawn
-        print(f"{run.path}: no pictures ({mask(kind_and_message(error, 300))})", file=sys.stderr)
+        print(f"{run.path}: no pictures ({mask(kind_and_message(error))[:300]})", file=sys.stderr)
         return []

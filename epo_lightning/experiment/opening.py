@@ -43,7 +43,7 @@ def refuse_unfinished(run: RunFolder) -> None:
     """Refuse to score or ship a run whose training has not ended.
 
     Raises:
-        ConfigError: as said.
+        ConfigError: the run is not finished; the message says how to continue it.
     """
     if not run.finished:
         raise ConfigError(f"{run.path} is not finished: continue it with `epo train resume={run.path}`")

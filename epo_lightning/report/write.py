@@ -146,7 +146,7 @@ def write_report(
 
 @dataclass(frozen=True)
 class _Found:
-    """What a report shows, as it was found in the records of its runs.
+    """Contents of a report, as they were found in the records of its runs.
 
     Attributes:
         tables: rows and their scores.

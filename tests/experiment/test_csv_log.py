@@ -7,7 +7,8 @@ import os
 import signal
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -80,6 +81,19 @@ def killed_everywhere(action: Callable[[], None], check: Callable[[], None], aga
         check()
 
 
+@contextmanager
+def files_of_at_most(size: int) -> Iterator[None]:
+    """Context in which no file can grow beyond a size [bytes], as on a full disk."""
+    import resource
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
 def test_a_kill_while_a_run_continues_loses_no_row_from_before(run: RunFolder) -> None:
     def kept() -> None:
         assert steps(run)[:3] == [0, 1, 2], "rows before the step that the run continues from"
@@ -114,36 +128,25 @@ def test_truncated_lines_are_ignored(run: RunFolder) -> None:
 
 
 def test_a_row_that_failed_on_a_full_disk_is_written_later(run: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
-    import resource
-
     write(run, 4)
     before = (run.logs / "metrics.csv").read_bytes()
     log = CSVLog(run, 1, continued_from=4)
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) + 2, hard))  # room for a piece of the row
-    try:
-        with pytest.raises(OSError, match="File too large"):
-            log.log_metrics({"train/loss": 5.0}, 4)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    with (
+        files_of_at_most(len(before) + 2),
+        pytest.raises(OSError, match="File too large"),
+    ):  # room for a piece of the row
+        log.log_metrics({"train/loss": 5.0}, 4)
     assert (run.logs / "metrics.csv").read_bytes() == before
     log.save()
     assert steps(run) == [0, 1, 2, 3, 4]
 
 
 def test_a_disk_that_is_full_when_a_column_is_added_keeps_the_rows(run: RunFolder) -> None:
-    import resource
-
     write(run, 4)
     log = CSVLog(run, 1, continued_from=4)
     before = (run.logs / "metrics.csv").read_bytes()
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before), hard))  # the file is replaced by a larger one
-    try:
-        with pytest.raises(OSError, match="File too large"):
-            log.log_metrics({"another": 5.0}, 4)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    with files_of_at_most(len(before)), pytest.raises(OSError, match="File too large"):  # a larger one replaces it
+        log.log_metrics({"another": 5.0}, 4)
     assert (run.logs / "metrics.csv").read_bytes() == before
     log.save()
     assert steps(run) == [0, 1, 2, 3, 4]
